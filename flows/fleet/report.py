@@ -16,8 +16,8 @@ from catalog.tables import Row
 from flows.fleet.manifest import Budget
 from flows.fleet.status import counts_of, planner_error
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.export.pictures import WorstView, read_beside
 from lidarpainter_models.export.report import Cell, Plot, Report, Table
-from lidarpainter_models.export.worst_views import WorstView, read_beside
 from tasks.reconstruction.report import WORST_FILE
 
 HOUR_S, GIGABYTE, GIBIBYTE = 3600.0, 1e9, 2.0**30

@@ -298,12 +298,4 @@ def _looking_in(azimuth_rad: float, elevation_rad: float, distance_m: float) -> 
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, down, -away], dim=1)
     pose[:3, 3] = distance_m * away
-    return Camera(
-        world_from_camera=pose,
-        fx_px=_FOCAL_PX,
-        fy_px=_FOCAL_PX,
-        cx_px=WIDTH_PX / 2,
-        cy_px=HEIGHT_PX / 2,
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
-    )
+    return Camera.centred(pose, _FOCAL_PX, width_px=WIDTH_PX, height_px=HEIGHT_PX)

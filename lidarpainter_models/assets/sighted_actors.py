@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.assets.box_views import box_view
-from lidarpainter_models.assets.sightings import Sighting
+from lidarpainter_models.assets.sightings import Sighting, box_view
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.images import squared_error

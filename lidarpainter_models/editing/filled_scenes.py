@@ -9,7 +9,7 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.ground_filling import fill_ground
-from lidarpainter_models.editing.hole_filling import changed_pixels, fill_holes, with_filling
+from lidarpainter_models.editing.hole_filling import changed_pixels, fill_holes
 from lidarpainter_models.editing.unseen_gaussians import without_unseen
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -53,11 +53,11 @@ def filled(world: EditedWorld, config: ConditionConfig, painter: Painter | None)
     refined = [replace(view, camera=world.scene.refined_camera(view)) for view in world.views]
     scene = without_unseen(world.scene, world.fitted, refined, world.left, street)
     scene, road = fill_ground(scene, street, world.ground, world.left)
-    scene = with_filling(scene, road)
+    scene = road.added_to(scene)
     builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=config)
     behind = fill_holes(builder, world.fitted, builder.refined_views, world.left, painter)
     return FilledScene(
-        scene=with_filling(scene, behind),
+        scene=behind.added_to(scene),
         confidence=torch.cat([road.confidence, behind.confidence]),
         num_ground=len(road.gaussians),
     )

@@ -50,6 +50,10 @@ class Filling:
     confidence: Float[Tensor, " gaussians"]
     """1 is as good as fitted."""
 
+    def added_to(self, scene: GaussianScene) -> GaussianScene:
+        """The scene with what was filled in, as its last rows."""
+        return scene.with_gaussians(scene.gaussians.append(self.gaussians))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Patch:
@@ -142,15 +146,15 @@ def fill_ground(
     Returns:
         The scene without what was wrong about its road, and what takes its place.
     """
-    fillings = []
+    known = [torch.zeros(0)]
     for track in left:
         scene, filling = _fill_one(scene, street, ground, track)
-        fillings.append(filling)
-        scene = scene.with_gaussians(scene.gaussians.append(filling.gaussians))
-    count = sum(len(filling.gaussians) for filling in fillings)
-    own = scene.gaussians.select(torch.arange(len(scene.gaussians) - count))
-    added = scene.gaussians.select(torch.arange(len(own), len(scene.gaussians)))
-    confidence = torch.cat([torch.zeros(0), *(filling.confidence for filling in fillings)])
+        known.append(filling.confidence)
+        scene = filling.added_to(scene)
+    confidence = torch.cat(known)
+    num_own = len(scene.gaussians) - len(confidence)
+    rows = torch.arange(len(scene.gaussians))
+    own, added = (scene.gaussians.select(some) for some in (rows[:num_own], rows[num_own:]))
     return scene.with_gaussians(own), Filling(gaussians=added, confidence=confidence)
 
 

@@ -105,8 +105,8 @@ def fill_holes(
         left: who is not there any more.
         painter: has the last word on colours; None leaves that to what is around.
     """
-    scene = builder.scene
-    fillings = [Filling(gaussians=scene.gaussians.select(_none()), confidence=torch.zeros(0))]
+    scene, confidence = builder.scene, [torch.zeros(0)]
+    num_before = len(scene.gaussians)
     for view in _chosen(views, left):
         before_m = fitted.render(view.camera, view.timestamp_ns).depth_m
         covered = shown_actors(view.camera, before_m, view.timestamp_ns, left)
@@ -117,18 +117,10 @@ def fill_holes(
         conditions = builder.conditions(view.camera, view.timestamp_ns)
         conditions = replace(conditions, render_rgb=render.rgb.clamp(0, 1))
         filling = _lifted(conditions, view.camera, holes, painter, scene.gaussians.sh_degree)
-        fillings.append(filling)
-        scene = scene.with_gaussians(scene.gaussians.append(filling.gaussians))
-    gaussians = fillings[0].gaussians
-    for filling in fillings[1:]:
-        gaussians = gaussians.append(filling.gaussians)
-    return Filling(
-        gaussians=gaussians, confidence=torch.cat([filling.confidence for filling in fillings])
-    )
-
-
-def _none() -> Tensor:
-    return torch.zeros(0, dtype=torch.int64)
+        confidence.append(filling.confidence)
+        scene = filling.added_to(scene)
+    added = scene.gaussians.select(torch.arange(num_before, len(scene.gaussians)))
+    return Filling(gaussians=added, confidence=torch.cat(confidence))
 
 
 def _chosen(views: Sequence[TrainingView], left: Sequence[ActorTrack]) -> list[TrainingView]:
@@ -195,8 +187,3 @@ def _coloured(
         confidence = torch.where(valid, WARP_CONFIDENCE, confidence)
     rgb = torch.where(conditions.lidar_hit[..., None], conditions.lidar_rgb, rgb)
     return rgb, torch.where(conditions.lidar_hit, LIDAR_CONFIDENCE, confidence)
-
-
-def with_filling(scene: GaussianScene, filling: Filling) -> GaussianScene:
-    """The scene with what was filled in, as its last rows."""
-    return scene.with_gaussians(scene.gaussians.append(filling.gaussians))

@@ -1,6 +1,5 @@
 """Other ways for an actor: along a trajectory, later, slower, to a stop. World: z up; metres."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -154,13 +153,11 @@ def stopped(track: ActorTrack, at_ns: int, log: LogTimes, *, over_s: float) -> A
 
     Who stands before it is last seen stays there as long as the log goes on.
     """
-
-    def warped(since_s: Float[Tensor, " times"]) -> Float[Tensor, " times"]:
-        braking = since_s.clamp(0, over_s)
-        way = braking - braking**2 / (2 * over_s) if over_s > 0 else torch.zeros_like(since_s)
-        return torch.where(since_s <= 0, since_s, way)
-
-    braked = _at_other_times(track, at_ns, warped)
+    since_s = (track.timestamps_ns - at_ns).double() * 1e-9
+    braking = since_s.clamp(0, over_s)
+    way = braking - braking**2 / (2 * over_s) if over_s > 0 else torch.zeros_like(since_s)
+    wanted_ns = at_ns + (torch.where(since_s <= 0, since_s, way) * 1e9).round().long()
+    braked = replace(track, world_from_box=path_of_track(track).at(wanted_ns).world_from_body)
     last_ns, stays_ns = int(track.timestamps_ns[-1]), log.around_ns[1]
     if at_ns + round(over_s * 1e9) > last_ns or last_ns >= stays_ns:
         return braked
@@ -202,13 +199,3 @@ def with_poses(
         world_from_box=world_from_box,
         num_points=torch.zeros_like(times_ns),
     )
-
-
-def _at_other_times(
-    track: ActorTrack,
-    from_ns: int,
-    warped: Callable[[Float[Tensor, " times"]], Float[Tensor, " times"]],
-) -> ActorTrack:
-    since_s = (track.timestamps_ns - from_ns).double() * 1e-9
-    wanted_ns = from_ns + (warped(since_s) * 1e9).round().long()
-    return replace(track, world_from_box=path_of_track(track).at(wanted_ns).world_from_body)

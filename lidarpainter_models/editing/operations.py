@@ -5,12 +5,22 @@ since the log began, lengths metres.
 """
 
 import json
+from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.styling.scene_style import LampState
+from lidarpainter_models.geometry.shifts import MAX_SHIFT_M
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.weather.mix import StyleMix
 
@@ -19,6 +29,14 @@ ASSET = "asset:"
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
 _Seconds = Annotated[float, Field(ge=0, le=1e6)]
 _Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
+
+
+def _leads_somewhere(spec: str, *, max_shift_m: float | None = None) -> str:
+    parse_trajectory(spec, max_shift_m=max_shift_m)
+    return spec
+
+
+_Way = Annotated[_Name, AfterValidator(_leads_somewhere)]
 
 
 class _Words(BaseModel):
@@ -70,13 +88,8 @@ class Move(_Words):
 
     op: Literal["move", "re-route"]
     actor: _Name
-    trajectory: _Name
+    trajectory: _Way
     """Off its own path: see `geometry/trajectory_specs.py`."""
-
-    @model_validator(mode="after")
-    def _leads_somewhere(self) -> "Move":
-        parse_trajectory(self.trajectory, max_shift_m=None)
-        return self
 
 
 class Insert(_Words):
@@ -93,13 +106,8 @@ class Insert(_Words):
     """Against the road."""
     speed_mps: Annotated[float, Field(ge=-100, le=100)] | None = None
     """Along the ego's path; None drives as the ego does."""
-    trajectory: _Name = "recorded"
+    trajectory: _Way = "recorded"
     """Off the path that these give."""
-
-    @model_validator(mode="after")
-    def _leads_somewhere(self) -> "Insert":
-        parse_trajectory(self.trajectory, max_shift_m=None)
-        return self
 
 
 class Swap(_Words):
@@ -184,12 +192,7 @@ class Drive(_Words):
     """Where the camera goes when the edited run is shown with the script; changes no scene."""
 
     op: Literal["drive"]
-    trajectory: _Name
-
-    @model_validator(mode="after")
-    def _leads_somewhere(self) -> "Drive":
-        parse_trajectory(self.trajectory)
-        return self
+    trajectory: Annotated[_Name, AfterValidator(partial(_leads_somewhere, max_shift_m=MAX_SHIFT_M))]
 
 
 class Style(_Words):
@@ -249,8 +252,6 @@ def parse_operations(found: Any, where: str) -> tuple[Operation, ...]:  # noqa: 
         message = first["msg"].removeprefix("Value error, ")
         step = f" operation {number + 1}" if isinstance(number, int) else ""
         raise ConfigError(f"{where}{step}{f', {place}' if place else ''}: {message}") from None
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
     if not operations:
         raise ConfigError(f"{where}: expected at least one operation")
     return operations

@@ -4,7 +4,6 @@ Every edit is one of both, or both; what has stood somewhere (`left`) and what s
 (`came`) is kept, since there neither the street nor the recorded images can be believed.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -246,8 +245,3 @@ def as_moving(track: ActorTrack, log: LogTimes) -> ActorTrack:
 def _carried_points(points: MapPoints, target_from_source: Float[Tensor, "4 4"]) -> MapPoints:
     xyz_m = transform_points(target_from_source.to(points.xyz_m), points.xyz_m)
     return replace(points, xyz_m=xyz_m)
-
-
-def boxes_at(tracks: Sequence[ActorTrack], timestamp_ns: int) -> list[ActorTrack]:
-    """Those that are there at a time."""
-    return [track for track in tracks if track.is_present(timestamp_ns)]

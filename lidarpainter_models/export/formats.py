@@ -27,9 +27,9 @@ class ExportFormat:
     kind: FormatKind
     summary: str
     """What it is, for a line of help."""
-    writer: str
-    """`module:function` that writes a file of it. Writers of scenes are called with a path, the
-    `SceneContents` and `time`, which of its moments is shown."""
+    writer: str = ""
+    """`module:function` that writes a file of a scene, a dataset or a sweep. Writers of scenes are
+    called with a path, the `SceneContents` and `time`, which of its moments is shown."""
     reader: str | None = None
     """`module:function` that reads a scene back; None where the file keeps every number."""
     endings: tuple[str, ...] = ()
@@ -38,10 +38,6 @@ class ExportFormat:
     """Whether a folder is written where the name of a file could stand too."""
     options: tuple[str, ...]
     """The options of `export` that it has a use for, beside the run and `--out`."""
-    loses: str
-    """What of a scene or drive such a file cannot say."""
-    extra: str | None = None
-    """The extra of the package that has to be installed."""
     is_moving: bool = False
     """Whether it holds a sequence of moments; other formats of scenes hold one."""
     takes_assets: bool = False
@@ -68,8 +64,6 @@ def _loaded(place: str) -> Callable[..., Any]:
 
 
 _HERE = "lidarpainter_models.export"
-_LOSES_STILL = "motion, and the exposure of cameras; sky and style are baked or left out"
-_LOSES_MOVING = "the exposure of cameras; lamps that blink, bodies that bend; sky and style"
 
 FORMATS: tuple[ExportFormat, ...] = (
     ExportFormat(
@@ -81,7 +75,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         endings=(".ply",),
         may_be_folder=True,
         options=(*_WHEN, "--per-actor"),
-        loses=_LOSES_STILL,
         takes_assets=True,
     ),
     ExportFormat(
@@ -92,8 +85,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         reader=f"{_HERE}.spz_files:read_spz",
         endings=(".spz",),
         options=(*_WHEN, "--spz-version"),
-        loses=f"{_LOSES_STILL}; numbers are rounded to 8 bits",
-        extra="export",
         takes_assets=True,
     ),
     ExportFormat(
@@ -103,7 +94,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         writer=f"{_HERE}.gltf_files:write_gltf",
         endings=(".glb",),
         options=_WHEN,
-        loses=_LOSES_MOVING,
         is_moving=True,
         takes_assets=True,
     ),
@@ -114,8 +104,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         writer=f"{_HERE}.usd_files:write_usd",
         endings=(".usdz", ".usdc", ".usda"),
         options=_WHEN,
-        loses=_LOSES_MOVING,
-        extra="export",
         is_moving=True,
     ),
     ExportFormat(
@@ -124,7 +112,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="recorded images, refined poses and LiDAR points for COLMAP",
         writer=f"{_HERE}.datasets:write_colmap",
         options=(*_WHERE, "--postpaint"),
-        loses="actors, LiDAR sweeps, times",
     ),
     ExportFormat(
         name="nerfstudio",
@@ -132,42 +119,33 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="the same for nerfstudio",
         writer=f"{_HERE}.datasets:write_nerfstudio",
         options=(*_WHERE, "--postpaint"),
-        loses="actors, LiDAR sweeps",
     ),
     ExportFormat(
         name="video",
         kind="views",
         summary="a film of what is seen along a trajectory",
-        writer=f"{_HERE}.videos:video_file",
         endings=(".mp4",),
         may_be_folder=True,
         options=(*_WHERE, "--postpaint", "--fps", "--beside"),
-        loses="geometry; colours are compressed",
     ),
     ExportFormat(
         name="depth",
         kind="views",
         summary="depth along a trajectory, as 16-bit PNG in 256ths of a metre",
-        writer=f"{_HERE}.images:write_depth_png",
         options=_WHERE,
-        loses="colours; what is farther than 256 m",
     ),
     ExportFormat(
         name="semantics",
         kind="views",
         summary="who is where along a trajectory, as 16-bit PNG",
-        writer=f"{_HERE}.images:write_index_png",
         options=_WHERE,
-        loses="colours; parked cars are part of the street",
     ),
     ExportFormat(
         name="page",
         kind="page",
         summary="the drive in one HTML file that plays from the disk",
-        writer=f"{_HERE}.page:sealed_page",
         endings=(".html", ".htm"),
         options=(*_WHERE, "--postpaint", "--beside"),  # the last two are refused with a reason
-        loses="colours that change with the direction; a style stands still",
     ),
     ExportFormat(
         name="lidar",
@@ -175,7 +153,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="recorded LiDAR sweeps as PCD",
         writer=f"{_HERE}.lidar_files:write_pcd",
         options=("--frames",),
-        loses="images, boxes, the scene",
     ),
     ExportFormat(
         name="lidar-bin",
@@ -183,7 +160,6 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="recorded LiDAR sweeps as nuScenes' .pcd.bin",
         writer=f"{_HERE}.lidar_files:write_pcd_bin",
         options=("--frames",),
-        loses="images, boxes, the scene; times of single points",
     ),
 )
 FORMAT_NAMES = tuple(row.name for row in FORMATS)

@@ -13,8 +13,8 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError, WriteError
 from lidarpainter_models.scenes.image_bytes import decode_image
 
-JPEG_QUALITY = 90
-WEBP_QUALITY = 80
+JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)
+WEBP = (cv2.IMWRITE_WEBP_QUALITY, 80)
 DEPTH_UNITS_PER_M = 256
 """Of a depth image, as KITTI has it: 4 mm apart, up to 256 m."""
 _MAX_U16 = 65535
@@ -27,7 +27,8 @@ def to_bytes(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
 
 def jpeg_data_url(rgb: Float[Tensor, "height width 3"]) -> str:
     """The image as a JPEG that stands inside a page."""
-    return "data:image/jpeg;base64," + base64.b64encode(_jpeg(rgb)).decode("ascii")
+    jpeg = _encoded(_bgr(rgb), ".jpg", JPEG)
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
 
 
 def write_jpeg(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
@@ -36,7 +37,7 @@ def write_jpeg(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     Raises:
         WriteError: the file cannot be written.
     """
-    return _write_bytes(_jpeg(rgb), path)
+    return _write(_bgr(rgb), path, ".jpg", JPEG)
 
 
 def read_image(path: Path) -> Float[Tensor, "height width 3"]:
@@ -71,7 +72,7 @@ def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     Raises:
         WriteError: the file cannot be written.
     """
-    return _write(cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR), path)
+    return _write(_bgr(rgb), path)
 
 
 def write_webp(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
@@ -80,8 +81,7 @@ def write_webp(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     Raises:
         WriteError: the file cannot be written.
     """
-    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
-    return _write(bgr, path, ".webp", [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
+    return _write(_bgr(rgb), path, ".webp", WEBP)
 
 
 def write_depth_png(depth_m: Float[Tensor, "height width"], path: Path) -> Path:
@@ -103,23 +103,20 @@ def write_index_png(indices: Int[Tensor, "height width"], path: Path) -> Path:
     return _write(indices.cpu().numpy().astype(np.uint16), path)
 
 
-def _jpeg(rgb: Float[Tensor, "height width 3"]) -> bytes:
-    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return encoded.tobytes()
+def _bgr(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
+    return cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
+
+
+def _encoded(image: np.ndarray, ending: str, options: Sequence[int]) -> bytes:
+    return cv2.imencode(ending, image, options)[1].tobytes()
 
 
 def _write(
     image: np.ndarray, path: Path, ending: str = ".png", options: Sequence[int] = ()
 ) -> Path:
-    _, encoded = cv2.imencode(ending, image, options)
-    return _write_bytes(encoded.tobytes(), path)
-
-
-def _write_bytes(content: bytes, path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        path.write_bytes(_encoded(image, ending, options))
     except OSError as error:
         raise WriteError(f"cannot write {path}: {error.strerror}") from None
     return path

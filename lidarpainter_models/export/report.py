@@ -10,12 +10,9 @@ from importlib.resources import files
 from itertools import cycle
 
 import jinja2
-from jaxtyping import Float
-from torch import Tensor
 
 from lidarpainter_models.export.images import jpeg_data_url
-from lidarpainter_models.export.moving_picture import MovingPicture
-from lidarpainter_models.export.worst_views import WorstView
+from lidarpainter_models.export.pictures import Comparison, MovingPicture, WorstView
 
 PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
@@ -26,21 +23,6 @@ SERIES_COLOURS = (
 )
 
 Cell = str | float | int | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Comparison:
-    """One view before and after beside the truth, with the images it was made from."""
-
-    title: str
-    before_label: str
-    before_rgb: Float[Tensor, "height width 3"]
-    after_label: str
-    after_rgb: Float[Tensor, "height width 3"]
-    truth_rgb: Float[Tensor, "height width 3"] | None = None
-    """None where nobody took an image."""
-    inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    """Label to rgb image: LiDAR image, warped reference, confidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +67,7 @@ class Report:
     """Names and values under a title; long ones are folded up."""
 
 
-def format_cell(value: str | float | int | None) -> str:
+def format_cell(value: Cell) -> str:
     """Print a cell: numbers with three decimals at most, None as a dash."""
     if value is None:
         return "-"
@@ -132,45 +114,9 @@ def render_report(report: Report) -> str:
     """The page as one HTML string."""
     source = files("lidarpainter_models.export").joinpath("report.html.j2").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    comparisons = [
-        {
-            "title": item.title,
-            "before_label": item.before_label,
-            "after_label": item.after_label,
-            "before": jpeg_data_url(item.before_rgb),
-            "after": jpeg_data_url(item.after_rgb),
-            "truth": None if item.truth_rgb is None else jpeg_data_url(item.truth_rgb),
-            "inputs": {label: jpeg_data_url(rgb) for label, rgb in item.inputs.items()},
-        }
-        for item in report.comparisons
-    ]
-    tables = [
-        {
-            "title": table.title,
-            "note": table.note,
-            "columns": table.columns,
-            "rows": [[format_cell(cell) for cell in row] for row in table.rows],
-        }
-        for table in report.tables
-    ]
+    environment.filters |= {"jpeg": jpeg_data_url, "cell": format_cell}
     return environment.from_string(source).render(
-        title=report.title,
-        summary=report.summary,
-        verdict=report.verdict,
-        moving=report.moving,
-        worst=[
-            {
-                "title": view.title,
-                "rendered": jpeg_data_url(view.rendered_rgb),
-                "truth": jpeg_data_url(view.truth_rgb),
-            }
-            for view in report.worst
-        ],
-        worst_title=report.worst_title,
-        repeat=report.repeat,
-        comparisons=comparisons,
-        tables=tables,
+        report=report,
         plots=[plot_geometry(plot) for plot in report.plots],
-        facts=report.facts,
         most_shown_facts=MOST_SHOWN_FACTS,
     )

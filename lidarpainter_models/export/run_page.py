@@ -13,15 +13,13 @@ from lidarpainter_models.evaluation.score_tables import (
     score_columns,
     score_rows,
 )
-from lidarpainter_models.export.moving_picture import MovingPicture
-from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
+from lidarpainter_models.export.pictures import Comparison, MovingPicture, WorstView
+from lidarpainter_models.export.report import Cell, Plot, Report, Table
 from lidarpainter_models.export.verdict import verdict
-from lidarpainter_models.export.worst_views import WorstView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 DRIVE_PAGE = "drive.html"
 """What the page that plays the drive is called where a command makes it."""
-MEGABYTE = 1e6
 MOST_ACTORS = 20
 """Rows of the table of actors."""
 GUIDANCE_COLUMNS = {
@@ -150,32 +148,11 @@ def _summary(result: Mapping[str, Any]) -> str:
 
 def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table]:
     """Scores, stages and painted views of a run."""
-    stages: list[list[Cell]] = [
-        [
-            cost.stage,
-            cost.seconds,
-            cost.cpu_seconds,
-            cost.peak_memory_bytes / MEGABYTE,
-            cost.artefact,
-        ]
-        for cost in costs
-    ]
-    guidance = [
-        [name, *(values[key] for key in GUIDANCE_COLUMNS)]
-        for name, values in result["guidance"].items()
-    ]
-    tables = [
-        Table(
-            title="Stages",
-            columns=["stage", "seconds", "CPU seconds", "peak memory, MB", "artefact"],
-            rows=stages,
-            note="As computed; a stage that was there already keeps the time it took then.",
-        ),
-    ]
+    tables = []
     if scores := score_rows(result):
         columns = [_with_unit(name) for name in score_columns(result["painter"])]
         note = f"{SCORE_NOTE} {HIGHER_NOTE}"
-        tables.insert(0, Table(title="Held-out views", columns=columns, rows=scores, note=note))
+        tables.append(Table(title="Held-out views", columns=columns, rows=scores, note=note))
     if by_camera := result.get("recorded_by_camera"):
         rows: list[list[Cell]] = [
             [name, *(values.get(key) for key in ("psnr", "ssim", "actors_psnr", "num_views"))]
@@ -184,15 +161,29 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
         heads = ("PSNR", "SSIM", "inside actor boxes PSNR")
         columns = ["camera", *map(_with_unit, heads), "views"]
         title = "Held-out views by camera"
-        tables.insert(-1, Table(title=title, columns=columns, rows=rows, note=HIGHER_NOTE))
+        tables.append(Table(title=title, columns=columns, rows=rows, note=HIGHER_NOTE))
     if envelope := result.get(ENVELOPE):
-        tables.insert(-1, _envelope(envelope))
-    if guidance:
+        tables.append(_envelope(envelope))
+    tables.append(
+        Table(
+            title="Stages",
+            columns=["stage", "seconds", "CPU seconds", "peak memory, MB", "artefact"],
+            rows=[
+                [one.stage, one.seconds, one.cpu_seconds, one.peak_memory_bytes / 1e6, one.artefact]
+                for one in costs
+            ],
+            note="As computed; a stage that was there already keeps the time it took then.",
+        )
+    )
+    if guidance := result["guidance"]:
         tables.append(
             Table(
                 title="Painted views",
                 columns=["round", *GUIDANCE_COLUMNS.values()],
-                rows=guidance,
+                rows=[
+                    [name, *(values[key] for key in GUIDANCE_COLUMNS)]
+                    for name, values in guidance.items()
+                ],
                 note=GUIDANCE_NOTE,
             )
         )
@@ -215,13 +206,7 @@ def _envelope(envelope: Mapping[str, Any]) -> Table:
     heads += [f"{words}, {unit} {HIGHER}" for words, unit in map(_direction, TRUSTED)]
     return Table(
         title="Where it can be trusted",
-        columns=[
-            "stretch, m",
-            "frames",
-            f"predicted there, dB {HIGHER}",
-            "confidence, 0 to 1",
-            *heads,
-        ],
+        columns=heads,
         rows=rows,
         note=(
             "So far off the recorded path, one way at a time, a frame has "
@@ -297,11 +282,9 @@ def _plots(histories: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Plot]
     size: dict[str, list[tuple[float, float]]] = {}
     spent_s = 0.0
     for name, history in histories.items():
-        minutes = [(spent_s + entry["cpu_s"]) / 60 for entry in history]
-        psnr[name] = [(at, entry["psnr"]) for at, entry in zip(minutes, history, strict=True)]
-        size[name] = [
-            (at, entry["num_gaussians"]) for at, entry in zip(minutes, history, strict=True)
-        ]
+        timed = [((spent_s + entry["cpu_s"]) / 60, entry) for entry in history]
+        psnr[name] = [(minutes, entry["psnr"]) for minutes, entry in timed]
+        size[name] = [(minutes, entry["num_gaussians"]) for minutes, entry in timed]
         spent_s += history[-1]["cpu_s"] if history else 0.0
     x_label = "CPU minutes of fitting"
     return [

@@ -1,5 +1,6 @@
 """What is written of a followed path: images, depth, who is where, films, pairs side by side."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -8,9 +9,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lidarpainter_models.conditioning.followed_paths import (
     FollowedPath,
@@ -19,7 +22,6 @@ from lidarpainter_models.conditioning.followed_paths import (
 )
 from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
-from lidarpainter_models.export.rig_images import rig_rows, tiled
 from lidarpainter_models.export.videos import images_per_second, video_file
 from lidarpainter_models.export.view_requests import RECORDING, ViewKinds
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -31,25 +33,9 @@ from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.scenes.records import RecordedView
 
 UNPAINTED_FOLDER = "unpainted"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Companion:
-    """What is shown to the left of every image."""
-
-    beside: str | GaussianScene
-    """The recording, the render before it was painted, or another scene of the same log."""
-
-    def image(
-        self, path: FollowedPath, camera: Camera, view: RecordedView, shown: ShownMoment
-    ) -> Float[Tensor, "height width 3"]:
-        """The other image, in [0, 1] and of the same size."""
-        if self.beside == RECORDING:
-            return recorded_image(path, camera, view)
-        if isinstance(self.beside, GaussianScene):
-            other = self.beside.render(camera, view.timestamp_ns, camera_name=view.camera_name)
-            return other.rgb.clamp(0, 1)
-        return shown.rgb if shown.unpainted_rgb is None else shown.unpainted_rgb
+MOST_AHEAD_DEG = 80.0
+"""Cameras that look farther aside stand in the lower row: of the rigs that readers know, the front
+ring of three stands above."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,18 +45,9 @@ class Delivery:
     kinds: ViewKinds
     calibration: Calibration
     """Turns evidence into confidence."""
-    companion: Companion | None = None
-    """What stands to the left in films and in `beside/`, above in a film of all cameras."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WrittenViews:
-    """What was written of the paths of a rig."""
-
-    rows: list[list[dict[str, Any]]]
-    """By path: where each view was taken, how far it can be trusted, and its files, as JSON."""
-    fps: float
-    """Images a second of films."""
+    beside: str | GaussianScene | None = None
+    """What stands to the left in films and in `beside/`, above in a film of all cameras: the
+    recording, the render before it was painted, or another scene of the same log."""
 
 
 def recorded_image(
@@ -96,7 +73,7 @@ def write_views(
     films: Sequence[Path] = (),
     together: Path | None = None,
     advanced: Callable[[], None],
-) -> WrittenViews:
+) -> tuple[list[list[dict[str, Any]]], float]:
     """Write everything that is wanted of the paths of a rig, moment by moment.
 
     Args:
@@ -106,8 +83,16 @@ def write_views(
         films: one for each path; none if empty.
         together: a film that shows all cameras at once.
         advanced: called after every view.
+
+    Returns:
+        By path, where each view was taken, how far it can be trusted, and its files, as JSON; and
+        images a second of films.
     """
-    rates = [_images_per_second(path, delivery.kinds) for path in paths]
+    fps = delivery.kinds.fps
+    rates = [
+        images_per_second([view.timestamp_ns for view in path.views]) if fps is None else fps
+        for path in paths
+    ]
     rows: list[list[dict[str, Any]]] = [[] for _ in paths]
     with ExitStack() as stack:
         writers = [
@@ -126,7 +111,7 @@ def write_views(
                 advanced()
             if rig is not None:
                 rig.add(_rig_image(paths, seen))
-    return WrittenViews(rows=rows, fps=max(rates))
+    return rows, max(rates)
 
 
 class _Written(NamedTuple):
@@ -163,12 +148,6 @@ def _written(
     return side_by_side(write, moments, paths[0].builder.scene.device)
 
 
-def _images_per_second(path: FollowedPath, kinds: ViewKinds) -> float:
-    if kinds.fps is not None:
-        return kinds.fps
-    return images_per_second([view.timestamp_ns for view in path.views])
-
-
 def _rig_image(paths: Sequence[FollowedPath], seen: dict[int, list[Tensor]]) -> Tensor:
     """What all cameras see at a moment, the companion above; black where one took no image."""
     rows = rig_rows(torch.stack([_ego_from_camera(path) for path in paths]))
@@ -192,17 +171,18 @@ def _write_view(
 ) -> tuple[dict[str, Any], list[Tensor]]:
     """One view's files: where it was taken, and what films show of it."""
     view, camera = path.views[number], path.camera(number)
-    kinds, companion = delivery.kinds, delivery.companion
+    kinds, beside = delivery.kinds, delivery.beside
     shown = path.shown(camera, view)
     seen = [shown.rgb]
-    if companion is not None:
-        seen.insert(0, companion.image(path, camera, view, shown).to(shown.rgb.device))
+    if beside is not None:
+        other = _beside(beside, path, camera, view, shown)
+        seen.insert(0, other.to(shown.rgb.device))
     wanted: list[tuple[str, Callable[..., Path], Tensor | None]] = []
     if kinds.images:
         wanted += [
             ("file", write_png, shown.rgb),
             (UNPAINTED_FOLDER, write_png, shown.unpainted_rgb),
-            ("beside", write_png, torch.cat(seen, dim=1) if companion else None),
+            ("beside", write_png, None if beside is None else torch.cat(seen, dim=1)),
         ]
     if kinds.depth:
         wanted.append(("depth", write_depth_png, shown.depth_m))
@@ -218,6 +198,22 @@ def _write_view(
             row[kind] = name if kind == "file" else f"{kind}/{name}"
             write(pixels, folder / row[kind])
     return row, seen
+
+
+def _beside(
+    beside: str | GaussianScene,
+    path: FollowedPath,
+    camera: Camera,
+    view: RecordedView,
+    shown: ShownMoment,
+) -> Float[Tensor, "height width 3"]:
+    """What stands to the left of an image, in [0, 1] and of the same size."""
+    if beside == RECORDING:
+        return recorded_image(path, camera, view)
+    if isinstance(beside, GaussianScene):
+        other = beside.render(camera, view.timestamp_ns, camera_name=view.camera_name)
+        return other.rgb.clamp(0, 1)
+    return shown.rgb if shown.unpainted_rgb is None else shown.unpainted_rgb
 
 
 def _confidence(
@@ -248,3 +244,45 @@ def legend(scene: GaussianScene) -> dict[str, Any]:
         | {str(SKY): {"class": "sky", "class_id": SKY}},
         "note": "parked cars are part of the street",
     }
+
+
+def rig_rows(ego_from_camera: Float[Tensor, "cameras 4 4"]) -> tuple[tuple[int, ...], ...]:
+    """Positions of the cameras, row by row, so that what is on the left in the car is on the left.
+
+    Cameras that look the same way stand in the order of their lenses.
+    """
+    upper: list[tuple[int, float, int]] = []
+    lower: list[tuple[int, float, int]] = []
+    for camera, pose in enumerate(ego_from_camera.tolist()):
+        azimuth_deg = math.degrees(math.atan2(pose[1][2], pose[0][2]))  # of z, which looks ahead
+        from_behind_deg = math.copysign(180 - abs(azimuth_deg), azimuth_deg)
+        is_ahead = abs(azimuth_deg) <= MOST_AHEAD_DEG
+        left_deg = azimuth_deg if is_ahead else from_behind_deg
+        (upper if is_ahead else lower).append((-round(left_deg), -pose[1][3], camera))
+    return tuple(tuple(camera for *_, camera in sorted(row)) for row in (upper, lower) if row)
+
+
+def tiled(
+    images: Sequence[Float[Tensor, "_ _ 3"]], rows: Sequence[Sequence[int]]
+) -> Float[Tensor, "height width 3"]:
+    """One image of several: all as high as the least high, the narrower row in the middle."""
+    height_px = min(image.shape[0] for image in images)
+    strips = [torch.cat([_as_high(images[one], height_px) for one in row], dim=1) for row in rows]
+    width_px = max(strip.shape[1] for strip in strips)
+    return torch.cat([_centred(strip, width_px) for strip in strips])
+
+
+def _as_high(image: Float[Tensor, "_ _ 3"], height_px: int) -> Float[Tensor, "{height_px} _ 3"]:
+    image = image.detach().cpu()
+    height, width, _ = image.shape
+    if height == height_px:
+        return image
+    size = (max(round(width * height_px / height), 1), height_px)
+    return torch.from_numpy(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA))
+
+
+def _centred(
+    strip: Float[Tensor, "height _ 3"], width_px: int
+) -> Float[Tensor, "height {width_px} 3"]:
+    lacking = width_px - strip.shape[1]
+    return pad(strip, (0, 0, lacking // 2, lacking - lacking // 2))

@@ -67,6 +67,26 @@ class Camera:
                 f"fy {self.fy_px}, {self.width_px} x {self.height_px} px"
             )
 
+    @classmethod
+    def centred(
+        cls,
+        world_from_camera: Float[Tensor, "4 4"],
+        focal_px: float,
+        *,
+        width_px: int,
+        height_px: int,
+    ) -> "Camera":
+        """A camera of square pixels that looks through the middle of its image."""
+        return cls(
+            world_from_camera=world_from_camera,
+            fx_px=focal_px,
+            fy_px=focal_px,
+            cx_px=width_px / 2,
+            cy_px=height_px / 2,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
     @property
     def camera_from_world(self) -> Float[Tensor, "4 4"]:
         """The inverse pose, float64."""

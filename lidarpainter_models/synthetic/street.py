@@ -109,16 +109,9 @@ class SyntheticStreet:
         """
         rig = self._rig(name)
         width_px, height_px = self.config.width_px, self.config.height_px
+        pose = self.world_from_ego(timestamp_ns) @ ego_from_camera(rig)
         focal_px = rig.focal_per_width * width_px
-        return Camera(
-            world_from_camera=self.world_from_ego(timestamp_ns) @ ego_from_camera(rig),
-            fx_px=focal_px,
-            fy_px=focal_px,
-            cx_px=width_px / 2,
-            cy_px=height_px / 2,
-            width_px=width_px,
-            height_px=height_px,
-        )
+        return Camera.centred(pose, focal_px, width_px=width_px, height_px=height_px)
 
     def actors(self, timestamp_ns: int) -> list[ActorState]:
         """Every actor's box at a time, in the order of `actor_index`."""

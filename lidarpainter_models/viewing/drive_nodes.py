@@ -18,8 +18,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.viewing.annotations import TrackNodes, vertical_fov_rad
-from lidarpainter_models.viewing.scene_nodes import SceneNodes, place_node
-from lidarpainter_models.viewing.sky_panels import SKY_M
+from lidarpainter_models.viewing.scene_nodes import SKY_M, SceneNodes, place_node
 
 ROOT = "/drive"
 SEAT_FROM_CAMERA = rigid_from_rotation(
@@ -45,71 +44,45 @@ class ShownDrive:
         """Whose path is followed."""
         return self.path.views[0].camera_name
 
-    def recorded_cameras(self) -> list[tuple[Camera, int]]:
-        """Where the followed camera stood at every moment, and when."""
-        return [
-            (self.path.camera(number), view.timestamp_ns)
-            for number, view in enumerate(self.path.views)
-        ]
-
 
 class DriveNodes:
     """The nodes of a drive, one moment at a time."""
 
+    shown: SceneNodes
+    """The scene that is shown."""
+    tracks: TrackNodes
+    """Boxes and ways of its actors."""
+
     def __init__(self, server: viser.ViserServer, drive: ShownDrive) -> None:
         """Send everything but scenes; those are sent when they are first shown."""
         self._api, self._drive = server.scene, drive
-        self._cameras = drive.recorded_cameras()
-        self._scenes: dict[str, _SentScene] = {}
+        self._cameras = [
+            (drive.path.camera(number), view.timestamp_ns)
+            for number, view in enumerate(drive.path.views)
+        ]
+        self._sent: dict[str, tuple[SceneNodes, TrackNodes]] = {}
         self._api.configure_default_lights(False)
         self._api.configure_environment_map(None)
         self._world = self._api.add_frame(ROOT, show_axes=False)
-        self.with_actors = True
         self.show_scene(next(iter(drive.scenes)))
         look_forward(server.initial_camera, self._cameras[0][0])
 
     def show_scene(self, name: str) -> None:
         """Show another of the drive's scenes; it is sent when it is first asked for."""
-        if name not in self._scenes:
-            self._scenes[name] = self._sent(f"{ROOT}/{name}", self._drive.scenes[name]())
-        self._shown = self._scenes[name]
-        for sent in self._scenes.values():
-            sent.nodes.visible = sent is self._shown
-
-    def _sent(self, root: str, scene: GaussianScene) -> "_SentScene":
-        camera_name = self._drive.camera_name
-        nodes = SceneNodes(self._api, root, scene, self._cameras, camera_name)
-        return _SentScene(scene, nodes, TrackNodes(self._api, root, scene.tracks))
-
-    @property
-    def scene(self) -> GaussianScene:
-        """The scene that is shown."""
-        return self._shown.scene
-
-    @property
-    def num_splats(self) -> int:
-        """How many splats of the shown scene the browser has."""
-        return self._shown.nodes.num_splats
-
-    @property
-    def tracks(self) -> TrackNodes:
-        """Boxes and ways of its actors."""
-        return self._shown.tracks
+        if name not in self._sent:
+            root, scene = f"{ROOT}/{name}", self._drive.scenes[name]()
+            camera_name = self._drive.camera_name
+            nodes = SceneNodes(self._api, root, scene, self._cameras, camera_name)
+            self._sent[name] = nodes, TrackNodes(self._api, root, scene.tracks)
+        self.shown, self.tracks = self._sent[name]
+        for nodes, _ in self._sent.values():
+            nodes.root.visible = nodes is self.shown
 
     def place(self, timestamp_ns: int, seat: Camera) -> None:
         """Show a moment from a seat."""
-        nodes = self._shown.nodes
-        nodes.with_actors = self.with_actors
-        nodes.place(timestamp_ns, seat.centre_world)
-        self.tracks.place(self.scene.actors.refined_poses(timestamp_ns))
+        self.shown.place(timestamp_ns, seat.centre_world)
+        self.tracks.place(self.shown.scene.actors.refined_poses(timestamp_ns))
         place_node(self._world, seat_from_world(seat))
-
-
-@dataclass(frozen=True, eq=False)
-class _SentScene:
-    scene: GaussianScene
-    nodes: SceneNodes
-    tracks: TrackNodes
 
 
 def seat_from_world(seat: Camera) -> Float[Tensor, "4 4"]:

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from lidarpainter_models.export.images import jpeg_data_url
 from lidarpainter_models.export.page import FirstView, PageNotes, sealed_page
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
 from lidarpainter_models.viewing.drive_nodes import DriveNodes, ShownDrive
@@ -69,14 +70,7 @@ def _first_view(drive: ShownDrive, nodes: DriveNodes) -> FirstView:
     width_px, height_px = FIRST_VIEW_PX
     seat, view = drive.path.camera(0), drive.path.views[0]
     focal_px = height_px / 2 / math.tan(vertical_fov_rad(seat) / 2)
-    wide = replace(
-        seat.at(seat.world_from_camera),
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
-    drawn = nodes.scene.render(wide, view.timestamp_ns, camera_name=view.camera_name)
-    return FirstView(data_url=jpeg_data_url(drawn.rgb), num_splats=nodes.num_splats)
+    pose = seat.world_from_camera
+    wide = Camera.centred(pose, focal_px, width_px=width_px, height_px=height_px)
+    drawn = nodes.shown.scene.render(wide, view.timestamp_ns, camera_name=view.camera_name)
+    return FirstView(data_url=jpeg_data_url(drawn.rgb), num_splats=nodes.shown.num_splats)

@@ -1,26 +1,48 @@
 """A fitted scene as nodes of a viser scene: street, sky, and a node for every actor.
 
 The nodes stand in the world frame below their root. What is drawn is sent once; a step in time
-sends each actor's pose and where the sky's cube stands, nothing else.
+sends each actor's pose and where the sky's cube stands, nothing else. The browser knows no sky
+texture: the sky is six pictures of a far cube, each in the frame of a camera (x right, y down, z
+forward) through its middle.
 """
 
+import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 import viser
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.export.images import to_bytes
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.geometry.transforms import (
+    quaternion_from_rotation,
+    rigid_from_rotation,
+)
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.viewing.browser_splats import BrowserSplats, recorded_rgb, splats_by_body
-from lidarpainter_models.viewing.sky_panels import SKY_M, sky_panels
 
 _STREET = 0
+SKY_M = 5000.0
+"""How far the cube's sides stand: a drive of 100 m moves the sky by a degree, and it is carried
+along with the car."""
+MOST_PX = 1024
+"""Of a picture's side; sharper skies are made coarser."""
+_FORWARD_AND_DOWN = {
+    "front": ((1, 0, 0), (0, 0, -1)),
+    "left": ((0, 1, 0), (0, 0, -1)),
+    "back": ((-1, 0, 0), (0, 0, -1)),
+    "right": ((0, -1, 0), (0, 0, -1)),
+    "top": ((0, 0, 1), (1, 0, 0)),
+    "bottom": ((0, 0, -1), (-1, 0, 0)),
+}
+"""World directions of every picture's z and y axes."""
 _UNFIT = re.compile(r"[^\w .-]+")
 """A slash in a node's name would make a child of it."""
 
@@ -42,11 +64,11 @@ class SceneNodes:
         exposure of `camera_name` at the first of these times. A style stands still: it is that of
         the middle of these times, seen from where the car was.
         """
-        self._scene = scene
+        self.scene = scene
         baked = scene.baked((cameras[0][1] + cameras[-1][1]) // 2)
-        self._root = api.add_frame(root, show_axes=False)
+        self.root = api.add_frame(root, show_axes=False)
         self._sky = api.add_frame(f"{root}/sky", show_axes=False)
-        self._actors = api.add_frame(f"{root}/actors", show_axes=False)
+        self.actors = api.add_frame(f"{root}/actors", show_axes=False)
         for panel in sky_panels(baked.sky):
             api.add_image(
                 f"{root}/sky/{panel.name}",
@@ -73,29 +95,10 @@ class SceneNodes:
                 self._bodies[body - 1] = add_splats(api, f"{root}/actors/{name}", splats)
         self.place(cameras[0][1], cameras[0][0].centre_world)
 
-    @property
-    def visible(self) -> bool:
-        """Whether the scene is shown at all."""
-        return self._root.visible
-
-    @visible.setter
-    def visible(self, shown: bool) -> None:
-        self._root.visible = shown
-
-    @property
-    def with_actors(self) -> bool:
-        """Whether its actors are shown."""
-        return self._actors.visible
-
-    @with_actors.setter
-    def with_actors(self, shown: bool) -> None:
-        if self._actors.visible != shown:
-            self._actors.visible = shown
-
     def place(self, timestamp_ns: int, centre_world: Float[Tensor, "3"]) -> None:
         """Put the actors where they stand at a time, and the sky around a place."""
         self._sky.position = centre_world.numpy()
-        poses, present = self._scene.actors.refined_poses(timestamp_ns)
+        poses, present = self.scene.actors.refined_poses(timestamp_ns)
         for actor, handle in self._bodies.items():
             place_node(handle, poses[actor], visible=bool(present[actor]))
 
@@ -130,3 +133,27 @@ def place_node(
         handle.position = position
     if not np.array_equal(handle.wxyz, rotation_wxyz):
         handle.wxyz = rotation_wxyz
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkyPanel:
+    """One side of the cube."""
+
+    name: str
+    rgb: Float[Tensor, "side side 3"]
+    world_from_panel: Float[Tensor, "3 3"]
+    """A rotation."""
+
+
+def sky_panels(sky: SkyTexture) -> list[SkyPanel]:
+    """All six sides, as sharp in their middle as the texture is."""
+    side_px = min(MOST_PX, math.ceil(2 / sky.layout.texel_rad))
+    panels = []
+    for name, (forward, down) in _FORWARD_AND_DOWN.items():
+        z, y = torch.tensor(forward).double(), torch.tensor(down).double()
+        rotation = torch.stack([torch.linalg.cross(y, z), y, z], dim=1)
+        pose = rigid_from_rotation(rotation, torch.zeros(3).double())
+        camera = Camera.centred(pose, side_px / 2, width_px=side_px, height_px=side_px)
+        rgb = sky.sample(sky.rays(camera))
+        panels.append(SkyPanel(name=name, rgb=rgb, world_from_panel=rotation))
+    return panels

@@ -29,7 +29,7 @@ from lidarpainter_models.geometry.transforms import (
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes
-from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, add_controls
+from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, Controls
 from lidarpainter_models.viewing.drive_nodes import (
     ROOT,
     DriveNodes,
@@ -67,7 +67,7 @@ class LiveViewer:
         self._lidar = LidarNodes(server.scene, f"{ROOT}/lidar")
         self._seat = drive.path.camera(0)
         server.gui.configure_theme(show_share_button=False, show_logo=False)
-        self.controls = add_controls(
+        self.controls = Controls(
             server.gui, num_moments=len(drive.path.views), scenes=list(drive.scenes)
         )
         self.controls.on_change(self.show)
@@ -85,7 +85,7 @@ class LiveViewer:
                 self._seat = self._camera_aside()
             self._nodes.show_scene(wanted.scene.value)
             wanted.painted.disabled = not self._is_paintable
-            self._nodes.with_actors = wanted.actors.value
+            self._nodes.shown.actors.visible = wanted.actors.value
             self._nodes.tracks.boxes.visible = wanted.boxes.value
             self._nodes.tracks.tracks.visible = wanted.tracks.value
             self._nodes.place(view.timestamp_ns, self._seat)
@@ -119,7 +119,7 @@ class LiveViewer:
             camera = self._camera_of(view)
             moment = self._drive.path.views[self._moment]
             painting = self._painting if painted and self._is_paintable else None
-            shown = ShownScene(scene=self._nodes.scene, painting=painting)
+            shown = ShownScene(scene=self._nodes.shown.scene, painting=painting)
             render = shown.renderer(self._drive.camera_name)
             return render(camera, moment.timestamp_ns).clamp(0, 1)
 
@@ -127,7 +127,7 @@ class LiveViewer:
     def _is_paintable(self) -> bool:
         """What is known of views is of the drive's own scene, and painters know clear days."""
         is_own = self.controls.scene.value == next(iter(self._drive.scenes))
-        return self._painting is not None and is_own and self._nodes.scene.style is None
+        return self._painting is not None and is_own and self._nodes.shown.scene.style is None
 
     @property
     def _moment(self) -> int:
@@ -167,15 +167,8 @@ class LiveViewer:
         width_px = self._seat.width_px
         height_px = max(round(width_px / view.aspect), 1)
         focal_px = height_px / 2 / math.tan(view.fov / 2)
-        return Camera(
-            world_from_camera=self._world_from_seat @ seat_from_view,
-            fx_px=focal_px,
-            fy_px=focal_px,
-            cx_px=width_px / 2,
-            cy_px=height_px / 2,
-            width_px=width_px,
-            height_px=height_px,
-        )
+        pose = self._world_from_seat @ seat_from_view
+        return Camera.centred(pose, focal_px, width_px=width_px, height_px=height_px)
 
     @property
     def _world_from_seat(self) -> Float[Tensor, "4 4"]:
@@ -202,7 +195,7 @@ class LiveViewer:
         self, origin_seat: Sequence[float], direction_seat: Sequence[float]
     ) -> ActorTrack | None:
         """The actor whose box a ray of the seat's frame meets first."""
-        actors = self._nodes.scene.actors
+        actors = self._nodes.shown.scene.actors
         moment = self._drive.path.views[self._moment]
         world_from_actors, present = actors.refined_poses(moment.timestamp_ns)
         there = [actors.recorded_tracks[row] for row in present.nonzero()[:, 0].tolist()]

@@ -14,11 +14,14 @@ from catalog.store import Store
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
-from lidarpainter_models.export.comparisons import Subject, comparisons
-from lidarpainter_models.export.moving_picture import recorded_beside
+from lidarpainter_models.export.pictures import (
+    comparisons,
+    recorded_beside,
+    worst_views,
+    write_beside,
+)
 from lidarpainter_models.export.report import render_report
 from lidarpainter_models.export.run_page import Pictures, RunPage, StageCost
-from lidarpainter_models.export.worst_views import worst_views, write_beside
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.observations.own_body import in_words
@@ -98,13 +101,13 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     unpainted: Callable[[], GaussianScene],
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
-    subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
-    pictures = _pictures(subject, shifts, said, progress)
+    painted = painting()
+    pictures = _pictures(held_out, unpainted(), painted, shifts, said, progress)
     report = replace(page, is_estimated=observations().is_estimated).report(
         held_out.scene,
         pictures,
         histories(),
-        machine(subject.painting.device),
+        machine(painted.device),
     )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
     if pictures.worst:
@@ -113,15 +116,20 @@ def _build(  # noqa: PLR0913 - all that the page is made from
 
 
 def _pictures(
-    subject: Subject, shifts: Sequence[Shift], said: Sequence[str], progress: Progress
+    held_out: HeldOut,
+    unpainted: GaussianScene,
+    painting: ViewTimePainting,
+    shifts: Sequence[Shift],
+    said: Sequence[str],
+    progress: Progress,
 ) -> Pictures:
-    fitted, held_out = subject.painting.conditions.scene, subject.held_out
+    fitted = painting.conditions.scene
     beside = shifts[0] if shifts else Shift(lateral_m=2.0)
     bodies = fitted.gaussians.body_index.long().cpu()
     names = [track.actor_id for track in fitted.actors.recorded_tracks]
     counts = torch.bincount(bodies, minlength=1 + len(names))[1:].tolist()
     return Pictures(
-        comparisons=comparisons(subject, shifts, progress=progress),
+        comparisons=comparisons(held_out, unpainted, painting, shifts, progress=progress),
         moving=recorded_beside(held_out, fitted, beside),
         worst=worst_views(held_out, fitted),
         actor_gaussians=dict(zip(names, counts, strict=True)),

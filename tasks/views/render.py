@@ -11,8 +11,9 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export import view_requests
-from lidarpainter_models.export.view_files import Companion, Delivery, legend, write_views
+from lidarpainter_models.export.view_files import Delivery, legend, write_views
 from lidarpainter_models.export.view_requests import ViewRequest
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.observations.settings import ObservationConfig
 from tasks.evaluation.shown import condition_builder
 from tasks.json_files import write_json
@@ -109,18 +110,19 @@ def write_paths(
         done += 1
         listener().advanced(STAGE, done, total, "")
 
-    written = write_views(
+    beside: str | GaussianScene | None = request.beside
+    if viewed.beside is not None:
+        beside = load_scene(opened(viewed.run).store, viewed.beside.gaussians)
+    written, fps = write_views(
         paths,
         folders,
-        Delivery(
-            kinds=kinds, calibration=viewed.calibration, companion=_companion(viewed, request)
-        ),
+        Delivery(kinds=kinds, calibration=viewed.calibration, beside=beside),
         films=films,
         together=together,
         advanced=advanced,
     )
     collisions = [[asdict(found) for found in path.collisions()] for path in paths]
-    for path, folder, rows, met in zip(paths, folders, written.rows, collisions, strict=True):
+    for path, folder, rows, met in zip(paths, folders, written, collisions, strict=True):
         if kinds.semantics:
             write_json(folder / LEGEND_FILE, legend(path.builder.scene))
         if kinds.has_poses:
@@ -130,12 +132,5 @@ def write_paths(
         "num_images": total,
         "cameras": ", ".join(path.camera_name for path in paths),
         "collisions": [found for met in collisions for found in met],
-        **({"fps": written.fps} if kinds.video else {}),
+        **({"fps": fps} if kinds.video else {}),
     }
-
-
-def _companion(viewed: ViewedRun, request: ViewRequest) -> Companion | None:
-    """What is shown to the left of every image."""
-    if viewed.beside is not None:
-        return Companion(beside=load_scene(opened(viewed.run).store, viewed.beside.gaussians))
-    return None if request.beside is None else Companion(beside=request.beside)

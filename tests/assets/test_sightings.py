@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.assets.box_views import SIDES, box_view
-from lidarpainter_models.assets.sightings import REACH_RAD, Sighting
+from lidarpainter_models.assets.sightings import REACH_RAD, SIDES, Sighting, box_view
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_parts import headed
 
@@ -25,15 +24,7 @@ def camera_from(azimuth_deg, *, distance_m=12.0, up_m=0.8):
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
     pose[:3, 3] = place
-    return Camera(
-        world_from_camera=pose,
-        fx_px=200.0,
-        fy_px=200.0,
-        cx_px=WIDTH_PX / 2,
-        cy_px=HEIGHT_PX / 2,
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
-    )
+    return Camera.centred(pose, 200.0, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 
 
 def sighting(cameras, depth_m=None):

@@ -19,15 +19,7 @@ HEIGHT, WIDTH = 40, 60
 def camera(x_m=0.0):
     world_from_camera = torch.eye(4, dtype=torch.float64)
     world_from_camera[0, 3] = x_m
-    return Camera(
-        world_from_camera=world_from_camera,
-        fx_px=50.0,
-        fy_px=50.0,
-        cx_px=WIDTH / 2,
-        cy_px=HEIGHT / 2,
-        width_px=WIDTH,
-        height_px=HEIGHT,
-    )
+    return Camera.centred(world_from_camera, 50.0, width_px=WIDTH, height_px=HEIGHT)
 
 
 def conditions(**changes):

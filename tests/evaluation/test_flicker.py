@@ -19,15 +19,7 @@ def camera_at(y_m):
     pose[:3, :3] = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     pose[1, 3] = y_m
     height_px, width_px = SIZE_PX
-    return Camera(
-        world_from_camera=pose,
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
+    return Camera.centred(pose, FOCAL_PX, width_px=width_px, height_px=height_px)
 
 
 def wall_frame(y_m, step=0, tint=0.0, moved_m=0.0):

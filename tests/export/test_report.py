@@ -3,13 +3,13 @@
 import html
 import json
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 import torch
+from chromium import found_browser
 from drawn_streets import drawn_street
 from tiny_street import tiny_street
 from toy_street import ToyStreet
@@ -29,7 +29,6 @@ from lidarpainter_models.export.run_page import Pictures, RunPage
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import record_street
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS_PX = (1400, 400)
 INPUTS = ("LiDAR", "warped recording", "painted at view time", "confidence")
 RESULT = {
@@ -76,6 +75,29 @@ def sample_report(title: str = "run") -> Report:
     )
 
 
+def run_page(street=None, *, has_lidar=True, is_estimated=False, **changes):
+    """The report about a run of the toy street, but for some of what the run printed."""
+    if street is None:
+        street = ToyStreet()
+        street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
+        street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
+    page = RunPage(
+        result=RESULT | {"recorded": None} | changes,
+        costs=[],
+        provenance={},
+        settings={"fit.steps": "40"},
+        has_lidar=has_lidar,
+        is_estimated=is_estimated,
+    )
+    return page.report(street, Pictures(), {}, {"processor": "abacus"})
+
+
+def judged(**figures):
+    """What a run printed whose scene was judged."""
+    found = {"recorded": {"psnr": 1.0, "num_views": 3, **figures}, "novel": {}}
+    return {**found, "unpainted": found}
+
+
 class Elements(HTMLParser):
     """Start tags of a page with their attributes, by name."""
 
@@ -120,14 +142,9 @@ def test_a_page_says_how_far_each_stretch_can_be_trusted():
         "calibration": {"record": "numbers made up"},
         "stretches": [stretch],
     }
-    result = RESULT | {"recorded": None, "envelope": envelope}
-    page = RunPage(result=result, costs=[], provenance={}, settings={}, has_lidar=True)
-    street = ToyStreet(4)
-    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 0}}
-    street.frame_timestamps_ns = torch.arange(4)
-    street.lidar_names = ()
-    tables = page.report(street, Pictures(), {}, {}).tables
+    tables = run_page(envelope=envelope).tables
     (table,) = [one for one in tables if one.title == "Where it can be trusted"]
+    assert len(table.columns) == len(table.rows[0])
     assert table.columns[-2:] == ["yaw left, degrees \u2191", "yaw right, degrees \u2191"]
     assert table.rows[0][0] == "0 to 19"
     assert table.rows[0][-2:] == [20.0, None]
@@ -149,13 +166,7 @@ def test_many_settings_are_folded_up_and_few_facts_are_not():
 
 def test_page_begins_with_what_the_scene_is(tmp_path):
     scene = DrivingScene.open(record_street(drawn_street(tiny_street()), tmp_path))
-    scores = {"psnr": 1.0, "num_views": 3}
-    judged = {"recorded": scores, "novel": {}}
-    result = {**RESULT, **judged, "unpainted": judged}
-    page = RunPage(
-        result=result, costs=[], provenance={}, settings={"fit.steps": "40"}, has_lidar=True
-    )
-    report = page.report(scene, Pictures(), {}, {"processor": "abacus"})
+    report = run_page(scene, **judged())
     assert report.summary[0].startswith(
         "Sequence street-0005 of the dataset synthetic: 6 frames in 0.5 s; 12 images of 2 cameras "
         "(front_camera, side_camera); "
@@ -171,51 +182,23 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
     [(True, "The LiDAR tells too little of the street"), (False, "No LiDAR swept")],
 )
 def test_a_page_says_that_points_were_estimated(has_lidar, words):
-    street = ToyStreet()
-    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
-    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
     for is_estimated in (True, False):
-        page = RunPage(
-            result=RESULT | {"recorded": None},
-            costs=[],
-            provenance={},
-            settings={},
-            has_lidar=has_lidar,
-            is_estimated=is_estimated,
-        )
-        said = page.report(street, Pictures(), {}, {}).verdict
+        said = run_page(has_lidar=has_lidar, is_estimated=is_estimated).verdict
         assert any(sentence.startswith(words) for sentence in said) == is_estimated
 
 
 def test_actors_have_their_psnr_and_results_without_it_a_dash():
-    street = ToyStreet()
-    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
-    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
     cells = []
     for of_actors in ({"psnr_by_actor": {"car": {"psnr": 25.5, "num_pixels": 9}}}, {}):
-        judged = {"recorded": {"psnr": 1.0, "num_views": 3, **of_actors}, "novel": {}}
-        page = RunPage(
-            result={**RESULT, **judged, "unpainted": judged},
-            costs=[],
-            provenance={},
-            settings={},
-            has_lidar=True,
-        )
-        (table,) = [
-            table
-            for table in page.report(street, Pictures(), {}, {}).tables
-            if table.title == "Actors"
-        ]
+        tables = run_page(**judged(**of_actors)).tables
+        (table,) = [table for table in tables if table.title == "Actors"]
         cells.append(dict(zip(table.columns, table.rows[0], strict=True))["PSNR, dB \u2191"])
     assert cells == [25.5, None]
 
 
 @pytest.fixture(scope="session")
 def browser():
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
-        pytest.skip(f"no browser here to lay the page out: none of {', '.join(BROWSERS)}")
-    return found
+    return found_browser()
 
 
 def laid_out(browser, page, folder):
@@ -252,14 +235,8 @@ def test_page_loads_nothing_from_elsewhere():
 
 
 def test_figures_have_units_and_say_which_way_is_better():
-    judged = {"recorded": {"psnr": 1.0, "num_views": 3}, "novel": {}}
-    by_camera = {"recorded_by_camera": {"front": {"psnr": 1.0, "ssim": 0.5, "num_views": 3}}}
-    result = {**RESULT, **judged, "unpainted": judged, **by_camera}
-    page = RunPage(result=result, costs=[], provenance={}, settings={}, has_lidar=True)
-    street = ToyStreet()
-    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
-    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
-    tables = page.report(street, Pictures(), {}, {}).tables
+    by_camera = {"front": {"psnr": 1.0, "ssim": 0.5, "num_views": 3}}
+    tables = run_page(**judged(), recorded_by_camera=by_camera).tables
     judging = [table for table in tables if any("PSNR" in name for name in table.columns)]
     assert len(judging) == 3
     for table in judging:

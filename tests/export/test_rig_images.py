@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.export.rig_images import rig_rows, tiled
+from lidarpainter_models.export.view_files import rig_rows, tiled
 
 AHEAD = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # right, down and forward in the car
 

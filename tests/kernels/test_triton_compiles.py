@@ -20,6 +20,6 @@ if WITHOUT_TRITON is not None:
 
 @pytest.mark.parametrize("architecture", [pytest.param(80, marks=pytest.mark.slow), 90])
 def test_every_kernel_compiles_to_machine_code_without_spilling(architecture):
-    found = machine_code("triton_trial_compilation.py", architecture, *WRITTEN)
+    found = machine_code(architecture, *WRITTEN)
     assert len(found) >= len(WRITTEN)
     assert_fits(found)

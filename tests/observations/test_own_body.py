@@ -72,14 +72,9 @@ class RoadDrive(ToyStreet):
                 frame_index=frame,
                 camera_name="front",
                 timestamp_ns=frame * 100_000_000,
-                camera=Camera(
-                    world_from_camera=rigid_from_rotation(
-                        looks, torch.tensor([step_m * frame, 0.0, 1.7])
-                    ).double(),
-                    fx_px=200,
-                    fy_px=200,
-                    cx_px=WIDTH_PX / 2,
-                    cy_px=HEIGHT_PX / 2,
+                camera=Camera.centred(
+                    rigid_from_rotation(looks, torch.tensor([step_m * frame, 0.0, 1.7])).double(),
+                    200,
                     width_px=WIDTH_PX,
                     height_px=HEIGHT_PX,
                 ),

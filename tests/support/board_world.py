@@ -5,17 +5,20 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
+from gaussian_world import (
+    LOOK_FORWARD,
+    cameras_of,
+    car_track,
+    map_points,
+    round_gaussians,
+    scene_of,
+)
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.warping import SourceImage
-from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
-from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
@@ -23,8 +26,6 @@ SECOND_NS = 1_000_000_000
 WALL_X_M = 12.0
 NUM_VIEWS = 5
 SKY_RGB = torch.tensor([0.5, 0.7, 0.9])
-# camera z looks along world x, camera x to the right (-y), camera y down (-z)
-FORWARD = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=torch.float64)
 
 
 @dataclass
@@ -47,17 +48,9 @@ def make_camera(
     x_m=0.0, y_m=0.0, z_m=1.5, *, yaw_rad=0.0, width_px=64, height_px=48, focal_px=60.0
 ):
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, yaw_rad], dtype=torch.float64))
-    return Camera(
-        world_from_camera=rigid_from_rotation(
-            turn @ FORWARD, torch.tensor([x_m, y_m, z_m], dtype=torch.float64)
-        ),
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
+    place = torch.tensor([x_m, y_m, z_m], dtype=torch.float64)
+    pose = rigid_from_rotation(turn @ LOOK_FORWARD.double(), place)
+    return Camera.centred(pose, focal_px, width_px=width_px, height_px=height_px)
 
 
 def draw_boards(camera, boards):
@@ -113,10 +106,9 @@ def moving_track() -> Callable[..., ActorTrack]:
     def make(starts_m, ends_m, *, size_m=(4.0, 2.0, 2.0), duration_ns=SECOND_NS, actor_id="car"):
         poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         poses[:, :3, 3] = torch.tensor([starts_m, ends_m], dtype=torch.float64)
-        return ActorTrack(
+        return replace(
+            car_track(2),
             actor_id=actor_id,
-            category="Car",
-            is_moving=True,
             size_m=torch.tensor(size_m),
             frame_indices=torch.tensor([0, 10]),
             timestamps_ns=torch.tensor([0, duration_ns]),
@@ -157,44 +149,24 @@ def views(camera_at, board, draw):
 def scene(views, board):
     """A wall of opaque discs in the board's colours under a plain sky."""
     points = wall_points()
-    count = len(points)
-    gaussians = GaussianSet(
-        means=points,
-        rotation_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+    count, rgb = len(points), board(WALL_X_M).colour(points[:, 1], points[:, 2])
+    discs = replace(
+        round_gaussians(points, rgb, sigma_m=0.2, sh_degree=0),
         log_scale=torch.tensor([0.01, 0.2, 0.2]).log().repeat(count, 1),
         opacity_logit=torch.full((count,), 4.0),
-        sh_dc=sh_from_rgb(board(WALL_X_M).colour(points[:, 1], points[:, 2])),
-        sh_rest=torch.zeros(count, 0, 3),
-        body_index=torch.zeros(count, dtype=torch.int64),
     )
-    keys = [view.key for view in views]
-    times = torch.tensor([view.timestamp_ns for view in views])
-    poses = torch.stack([view.camera.world_from_camera for view in views])
-    layout = sky_layout([view.camera for view in views])
-    return GaussianScene(
-        gaussians=gaussians,
-        sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),
-        cameras=CameraCorrections.none(keys, times, poses),
-        actors=Actors.uncorrected((), times),
-        exposure=ExposureCorrections.none(["front"], [0]),
-    )
+    cameras = [view.camera for view in views]
+    times_ns = torch.tensor([view.timestamp_ns for view in views])
+    made = scene_of(discs, cameras, sky_rgb=SKY_RGB, timestamps_ns=times_ns)
+    return replace(made, cameras=cameras_of(views))
 
 
 @pytest.fixture
 def lidar_map(board):
     points = wall_points()[::2]
-    colour = board(WALL_X_M).colour(points[:, 1], points[:, 2])
-    street = replace(
-        MapPoints.uncoloured(
-            xyz_m=points,
-            frame_index=torch.zeros(len(points), dtype=torch.int64),
-            timestamp_ns=torch.full((len(points),), 200_000_000),
-            range_m=points.norm(dim=-1),
-        ),
-        rgb_u8=(colour * 255).to(torch.uint8),
-        has_colour=torch.ones(len(points), dtype=torch.bool),
-    )
-    return LidarMap(street=street, actors={})
+    street = map_points(points, board(WALL_X_M).colour(points[:, 1], points[:, 2]))
+    taken_ns = torch.full((len(points),), 200_000_000)
+    return LidarMap(street=replace(street, timestamp_ns=taken_ns), actors={})
 
 
 @pytest.fixture

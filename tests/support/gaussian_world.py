@@ -28,15 +28,8 @@ CAR_SIZE_M = torch.tensor([2.0, 1.0, 1.0])
 
 def camera_at(x_m, *, width_px=WIDTH_PX, height_px=HEIGHT_PX):
     """A camera that looks along world x."""
-    return Camera(
-        world_from_camera=rigid_from_rotation(LOOK_FORWARD, torch.tensor([x_m, 0.0, 1.0])).double(),
-        fx_px=0.8 * width_px,
-        fy_px=0.8 * width_px,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
+    pose = rigid_from_rotation(LOOK_FORWARD, torch.tensor([x_m, 0.0, 1.0])).double()
+    return Camera.centred(pose, 0.8 * width_px, width_px=width_px, height_px=height_px)
 
 
 def turned_camera(yaw_rad):
@@ -101,12 +94,16 @@ def scene_trained_on(views):
     """One Gaussian ahead of the given recorded views, which are the scene's training views."""
     ahead = round_gaussians(torch.tensor([[8.0, 0.0, 1.0]]), torch.full((1, 3), 0.5), sigma_m=0.5)
     scene = scene_of(ahead, [view.camera for view in views])
-    cameras = CameraCorrections.none(
+    return replace(scene, cameras=cameras_of(views))
+
+
+def cameras_of(views):
+    """The cameras of training views, not corrected."""
+    return CameraCorrections.none(
         [view.key for view in views],
         torch.tensor([view.timestamp_ns for view in views]),
         torch.stack([view.camera.world_from_camera for view in views]),
     )
-    return replace(scene, cameras=cameras)
 
 
 def training_view(camera, *, frame=0, **shown):

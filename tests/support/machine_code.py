@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 
-def machine_code(script, *words):
-    """What a script beside this one finds of kernels: their registers and stack, by name."""
+def machine_code(*words):
+    """What `triton_compilation.py` finds of kernels: their registers and stack, by name."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     result = subprocess.run(
-        [sys.executable, Path(__file__).with_name(script), *map(str, words)],
+        [sys.executable, Path(__file__).with_name("triton_compilation.py"), *map(str, words)],
         capture_output=True,
         text=True,
         check=False,

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from pickled_tables import pickled_table
+from scipy.spatial.transform import Rotation
 
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
@@ -30,12 +31,6 @@ EGO_MPS, OTHER_MPS = 10.0, 8.0
 OTHER_AHEAD_M, PARKED_AHEAD_M, PARKED_LEFT_M = 12.0, 9.0, 4.0
 CAR_SIZE_M = (4.0, 2.0, 1.6)
 SPINNING_SEES_S, FORWARD_SEES_S = -0.05, -0.02
-
-
-@pytest.fixture(name="pickled_table")
-def pickled_table_maker():
-    """The function that writes tables, for tests that need their own."""
-    return pickled_table
 
 
 # --- the world those tables describe
@@ -67,22 +62,12 @@ def box_surface(centre_m: np.ndarray, seed: int, num_points: int = 60) -> np.nda
     return centre_m + local @ axes
 
 
-def _heading(columns: np.ndarray) -> dict[str, float]:
-    """Quaternion of a rotation whose columns are given."""
-    w = np.sqrt(max(0.0, 1 + np.trace(columns))) / 2
-    if w > 1e-3:
-        x = (columns[2, 1] - columns[1, 2]) / (4 * w)
-        y = (columns[0, 2] - columns[2, 0]) / (4 * w)
-        z = (columns[1, 0] - columns[0, 1]) / (4 * w)
-    else:
-        axis = np.linalg.eigh(columns + columns.T)[1][:, -1]
-        x, y, z = axis
-    return {"w": float(w), "x": float(x), "y": float(y), "z": float(z)}
-
-
 def _pose(columns: np.ndarray, position: np.ndarray) -> dict[str, dict[str, float]]:
-    place = dict(zip("xyz", position.tolist(), strict=True))
-    return {"position": place, "heading": _heading(columns)}
+    heading = Rotation.from_matrix(columns).as_quat(scalar_first=True).tolist()
+    return {
+        "position": dict(zip("xyz", position.tolist(), strict=True)),
+        "heading": dict(zip("wxyz", heading, strict=True)),
+    }
 
 
 def camera_axes(camera: str) -> np.ndarray:
@@ -122,7 +107,16 @@ class PandasetFolder:
         return read_table_bytes((self.path / name).read_bytes(), self.path / name)
 
     def boxes_at(self, time_s: float) -> list[dict[str, Any]]:
-        return boxes_at(time_s)
+        """The parked car once, the moving one as each LiDAR saw it."""
+        parked = {"uuid": "parked", "stationary": True, "sensor": -1, "sibling": "-"}
+        moving = {"stationary": False}
+        spinning = {"uuid": "moving-0", "sensor": 0, "sibling": "moving-1"}
+        forward = {"uuid": "moving-1", "sensor": 1, "sibling": "moving-0"}
+        return [
+            {**parked, "centre": parked_position()},
+            {**moving, **spinning, "centre": other_position(time_s + SPINNING_SEES_S)},
+            {**moving, **forward, "centre": other_position(time_s + FORWARD_SEES_S)},
+        ]
 
     def write_log(self) -> None:
         times_s = self.frame_times_s()
@@ -138,7 +132,7 @@ class PandasetFolder:
         self.write("annotations/semseg/classes.json", classes)
         for index, time_s in enumerate(times_s):
             self._write_points(index, time_s)
-            self.write_boxes(index, boxes_at(time_s))
+            self.write_boxes(index, self.boxes_at(time_s))
 
     def _write_camera(self, camera: str, times_s: list[float]) -> None:
         folder = f"camera/{camera}_camera"
@@ -204,19 +198,6 @@ class PandasetFolder:
 
     def ingest(self, store: Path, **options: Any) -> Path:
         return ingest_scene("pandaset", self.root, self.sequence, store, **options)
-
-
-def boxes_at(time_s: float) -> list[dict[str, Any]]:
-    """The parked car once, the moving one as each LiDAR saw it."""
-    parked = {"uuid": "parked", "stationary": True, "sensor": -1, "sibling": "-"}
-    moving = {"stationary": False}
-    spinning = {"uuid": "moving-0", "sensor": 0, "sibling": "moving-1"}
-    forward = {"uuid": "moving-1", "sensor": 1, "sibling": "moving-0"}
-    return [
-        {**parked, "centre": parked_position()},
-        {**moving, **spinning, "centre": other_position(time_s + SPINNING_SEES_S)},
-        {**moving, **forward, "centre": other_position(time_s + FORWARD_SEES_S)},
-    ]
 
 
 @pytest.fixture

@@ -3,11 +3,10 @@
 from dataclasses import replace
 
 import torch
-from gaussian_world import FRAME_NS, camera_at, round_gaussians, scene_of
+from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle, StyledPlace
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
-from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.weather.mix import StyleMix
 
 NUM_FRAMES = 4
@@ -27,16 +26,7 @@ def car_ahead():
         ).double()
         for frame in range(NUM_FRAMES)
     ]
-    return ActorTrack(
-        actor_id="car",
-        category="Car",
-        is_moving=True,
-        size_m=CAR_SIZE_M,
-        frame_indices=torch.arange(NUM_FRAMES),
-        timestamps_ns=torch.arange(NUM_FRAMES) * FRAME_NS,
-        world_from_box=torch.stack(poses),
-        num_points=torch.full((NUM_FRAMES,), 50),
-    )
+    return replace(car_track(NUM_FRAMES), size_m=CAR_SIZE_M, world_from_box=torch.stack(poses))
 
 
 def _sheet(first, second, build, rgb, *, body=0):

@@ -1,7 +1,8 @@
-"""Compile the rasteriser's Triton kernels for a GPU that need not be there.
+"""Compile Triton kernels for a GPU that need not be there.
 
 `python triton_compilation.py ARCHITECTURE COEFFICIENTS FEATURES` draws a scene with gradients,
-catches every launch before it runs, and compiles it to machine code by the compiler and assembler
+`... ARCHITECTURE KERNEL ...` runs `kernel_trials` of these kernel packages; either catches every
+launch before it runs, and compiles it to machine code by the compiler and assembler
 in Triton's wheel. It prints, as JSON by kernel, the registers of a thread and the bytes of stack,
 which are spilled registers. `TRITON_INTERPRET` must not be set.
 """
@@ -16,10 +17,12 @@ from typing import Any
 
 import torch
 import triton
+from kernel_trials import TRIALS
 from splat_drawing import pinhole
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from lidarpainter_models.kernels import backends
 from lidarpainter_models.kernels.gaussian_raster import triton as backend
 
 TYPES = {
@@ -110,10 +113,17 @@ def catch_launches(architecture):
 
 
 def main():
-    architecture, coefficients, features = (int(word) for word in sys.argv[1:])
-    found = catch_launches(architecture)
-    drawn = backend._DrawView.apply(*scene(coefficients, features))
-    sum(image.sum() for image in drawn[:4]).backward()
+    architecture, *words = sys.argv[1:]
+    found = catch_launches(int(architecture))
+    if words[0].isdigit():
+        drawn = backend._DrawView.apply(*scene(*map(int, words)))
+        sum(image.sum() for image in drawn[:4]).backward()
+    else:
+        doors: Any = backends
+        doors.why_no_triton = lambda: None
+        doors.is_interpreting = lambda: True
+        for kernel in words:
+            TRIALS[kernel].run("triton", torch.device("cpu"))
     sys.stdout.write(json.dumps(found))
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from waymo_damage import split
 
 from lidarpainter_models.checks.overlay import draw_boxes
 from lidarpainter_models.geometry.transforms import invert_rigid
@@ -107,38 +108,12 @@ def record_content(path, index=0):
 
 def fields(content):
     """The fields of a protobuf message: a list of (number, value); messages stay bytes."""
-    found, position = [], 0
-    while position < len(content):
-        key, position = _varint(content, position)
-        number, kind = key >> 3, key & 7
-        if kind == 0:
-            value, position = _varint(content, position)
-        elif kind in (1, 5):
-            size = 8 if kind == 1 else 4
-            (value,) = struct.unpack_from("<d" if kind == 1 else "<f", content, position)
-            position += size
-        else:
-            size, position = _varint(content, position)
-            value = content[position : position + size]
-            position += size
-        found.append((number, value))
-    return found
+    return [(number, value) for number, _, value in split(content)]
 
 
 def all_of(content, number):
     """The values of a repeated field."""
     return [value for found, value in fields(content) if found == number]
-
-
-def _varint(content, position):
-    value = shift = 0
-    while True:
-        byte = content[position]
-        position += 1
-        value |= (byte & 0x7F) << shift
-        shift += 7
-        if byte < 0x80:
-            return value, position
 
 
 if __name__ == "__main__":

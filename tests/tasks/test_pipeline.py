@@ -22,7 +22,7 @@ from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.evaluation.settings import ScoringConfig
-from lidarpainter_models.export.moving_picture import PANEL_WIDTH_PX
+from lidarpainter_models.export.pictures import PANEL_WIDTH_PX
 from lidarpainter_models.gaussians.fitting.plan import in_thousands
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips

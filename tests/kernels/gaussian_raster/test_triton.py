@@ -100,7 +100,7 @@ def test_a_fit_by_triton_is_that_by_numba(monkeypatch):
 
 
 def test_every_kernel_compiles_to_machine_code_without_spilling():
-    found = machine_code("triton_compilation.py", 90, 1, 1)
+    found = machine_code(90, 1, 1)
     assert set(found) == KERNELS
     assert_fits(found)
 
@@ -109,7 +109,7 @@ def test_every_kernel_compiles_to_machine_code_without_spilling():
 @pytest.mark.parametrize("architecture", [80, 90])
 @pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1), (4, 2)])
 def test_every_kernel_compiles_for_every_degree(architecture, coefficients, features):
-    assert_fits(machine_code("triton_compilation.py", architecture, coefficients, features))
+    assert_fits(machine_code(architecture, coefficients, features))
 
 
 def test_a_machine_without_triton_is_told_so(monkeypatch):

@@ -14,15 +14,7 @@ def forward_camera():
     world_from_camera = torch.eye(4, dtype=torch.float64)
     world_from_camera[:3, :3] = torch.tensor([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
     world_from_camera[2, 3] = CAMERA_HEIGHT_M
-    return Camera(
-        world_from_camera=world_from_camera,
-        fx_px=FOCAL_PX,
-        fy_px=FOCAL_PX,
-        cx_px=WIDTH_PX / 2,
-        cy_px=HEIGHT_PX / 2,
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
-    )
+    return Camera.centred(world_from_camera, FOCAL_PX, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 
 
 def street_view(*, with_camera=True):
