@@ -415,7 +415,9 @@ def _through(shot: Shot, distortion: Distortion, zoom: float) -> Shot:
     places = (np.nan_to_num(rays) * scale + centre).clip(-1e4, 1e4).astype(np.float32)
     places = places.reshape(lens.height_px, lens.width_px, 2)
     seen = shot.with_pixels(
-        lambda bgr: cv2.remap(bgr, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        lambda bgr: cv2.remap(
+            bgr, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
     )
     return replace(seen, record=replace(seen.record, camera=lens, distortion=distortion))
 
@@ -447,22 +449,22 @@ PROXIES: dict[str, dict[str, str]] = {
     "empty": {"http_proxy": "", "no_proxy": ""},
     "not-for-us": {"http_proxy": "http://127.0.0.1:9", "no_proxy": "127.0.0.1,localhost"},
 }
-PREFECT_HOME = {"PREFECT_HOME": None}
+PREFECT_HOME: dict[str, str | None] = {"PREFECT_HOME": None}
 
 
 def _file_as_home(root: Path) -> dict[str, str | None]:
     (root / "home-file").write_text("no folder")
-    return {"HOME": str(root / "home-file")} | PREFECT_HOME
+    return {"HOME": str(root / "home-file"), **PREFECT_HOME}
 
 
 HOMES: dict[str, Callable[[Path], dict[str, str | None]]] = {
     "as-it-is": lambda _root: {},
-    "own": lambda root: {"HOME": str(root / "home")} | PREFECT_HOME,
-    "unset": lambda _root: {"HOME": None} | PREFECT_HOME,
-    "missing": lambda _root: {"HOME": "/nonexistent/home"} | PREFECT_HOME,
-    "not-writable": lambda _root: {"HOME": "/proc"} | PREFECT_HOME,
+    "own": lambda root: {"HOME": str(root / "home"), **PREFECT_HOME},
+    "unset": lambda _root: {"HOME": None, **PREFECT_HOME},
+    "missing": lambda _root: {"HOME": "/nonexistent/home", **PREFECT_HOME},
+    "not-writable": lambda _root: {"HOME": "/proc", **PREFECT_HOME},
     "a-file": _file_as_home,
-    "relative": lambda _root: {"HOME": "home"} | PREFECT_HOME,
+    "relative": lambda _root: {"HOME": "home", **PREFECT_HOME},
 }
 """Paths, proxies and homes by name; variables that are None are not set."""
 

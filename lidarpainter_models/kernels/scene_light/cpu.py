@@ -111,9 +111,8 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 def _arrays(part: Part) -> Part:
     """The same named tuple of arrays, as compiled code takes it."""
-    return part._make(
-        _array(value) if isinstance(value, Tensor) else np.float32(value) for value in part
-    )
+    kind: Any = type(part)
+    return kind(*(_array(v) if isinstance(v, Tensor) else np.float32(v) for v in part))
 
 
 def _lamps(lamps: scene_light.Lamps, counts: Tensor) -> _Lamps:
