@@ -36,6 +36,7 @@ def of_kind(records, kind):
     return [record for record in records if record["kind"] == kind]
 
 
+@pytest.mark.slow
 def test_a_parked_car_comes_out_whole_and_in_its_box_frame(written):
     folder, records = written
     (car,) = of_kind(records, "actor")

@@ -62,6 +62,7 @@ def delivered_psnr(store, run_id, folder):
     return psnr_from_error(float(torch.cat(wrong).mean()))
 
 
+@pytest.mark.slow
 def test_gain_of_painting_is_that_of_the_delivered_files(stereo_run, tmp_path):
     store, run_id = stereo_run
     words = ("evaluate", run_id, "--protocol", "cross-camera", "--postpaint", "--json")

@@ -71,6 +71,7 @@ def test_the_same_change_is_recalled_and_another_one_is_not(derive):
     assert again["computed_now"] == {"brighten": False}
 
 
+@pytest.mark.slow
 def test_a_changed_run_is_shown_judged_and_deleted_without_its_source(own_run, derive, tmp_path):
     store = own_run.store
     run_id = derive(replace(BRIGHTER, parameters={"by": -0.3}))["run_id"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from commands import call
 
 import lidarpainter_models as lp
@@ -56,6 +57,7 @@ def test_tutorial_ends_with_a_lane_aside(tmp_path, monkeypatch, prefect_api):  #
     assert "<title>LidarPainter: my-car/monday</title>" in Path("drive.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_notebook_runs_cell_by_cell(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     notebook = json.loads((DOCS / "examples/lane_aside.ipynb").read_text("utf-8"))

@@ -61,6 +61,7 @@ def blend_in(install, home, *, code=BLEND_ONE_POINT):
     return int(hits)
 
 
+@pytest.mark.slow
 def test_read_only_install_keeps_compiled_code_in_the_users_cache(read_only_install, tmp_path):
     home = tmp_path / "home"
     home.mkdir()
@@ -69,6 +70,7 @@ def test_read_only_install_keeps_compiled_code_in_the_users_cache(read_only_inst
     assert blend_in(read_only_install, home) == 1
 
 
+@pytest.mark.slow
 def test_without_any_place_to_write_the_prepared_command_still_compiles(
     read_only_install, tmp_path
 ):

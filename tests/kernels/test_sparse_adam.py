@@ -188,6 +188,7 @@ def bits_of(steps, *, count=21, change=lambda _state: None):
     return [*run.finished(), run.state.first, run.state.second, run.state.last]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("_backend", [TRITON])
 def test_neither_blocks_nor_checkpoints_change_a_bit(_backend, monkeypatch):
     def taken_up(state):

@@ -67,6 +67,7 @@ def test_contrast_does_not_see_exposure():
     assert np.allclose(dark, bright, atol=0.1)  # black is not quite black
 
 
+@pytest.mark.slow
 def test_each_sweep_is_read_once_for_all_cameras(monkeypatch):
     street = ToyStreet(num_frames=8, camera_gains=(("front", 1.0), ("beside", 0.8)))
     driving = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 10.0]))

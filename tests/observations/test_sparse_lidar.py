@@ -125,6 +125,7 @@ def test_a_car_that_stands_has_the_little_that_was_measured():
     assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
 
 
+@pytest.mark.slow
 def test_a_lidar_that_met_nothing_leaves_the_street_to_the_images():
     street = WallDrive()
     views = split_views(street, "all")

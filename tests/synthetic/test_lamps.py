@@ -257,6 +257,7 @@ def test_lenses_lie_on_the_rear_of_every_kind_of_car(kind):
     assert PROUD_M + RIM_M < left.size_m[0] + PROUD_M < 0.15  # curved with the bodywork
 
 
+@pytest.mark.slow
 def test_an_edited_street_keeps_the_lamps_of_those_who_stay(street):
     edited = street.changed(lambda actors: actors[1:])
     before = [state for state in street.lamps(START_NS) if state.actor_index != 0]

@@ -236,6 +236,7 @@ def looking_down(position):
     )
 
 
+@pytest.mark.slow
 def test_shifted_cameras_are_above_the_road_and_inside_nothing(street, other_street):
     check_shifted_cameras(street)
     check_shifted_cameras(other_street)

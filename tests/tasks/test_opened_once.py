@@ -94,6 +94,7 @@ def counted(tmp_path, monkeypatch):
     return counted
 
 
+@pytest.mark.slow
 def test_a_run_opens_its_scene_and_its_painter_once_and_decodes_once_a_stage(counted):
     assert counted.opened == ["begin"]
     assert [name for _, name in counted.painters] == ["overlay"]

@@ -253,6 +253,7 @@ def stubbed(store, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_the_command_runs_two_workers_and_says_how_it_stands(stubbed, store, tmp_path):
     behave(store.root, STREETS[1], "bad")
     path = write_stub_manifest(tmp_path)
@@ -283,6 +284,7 @@ def test_the_command_runs_two_workers_and_says_how_it_stands(stubbed, store, tmp
     assert store.tables.rows("attempts") == before
 
 
+@pytest.mark.slow
 def test_a_fleet_that_failed_exits_otherwise_and_can_be_retried(stubbed, store, tmp_path):
     behave(store.root, STREETS[0], "no memory")
     path = write_stub_manifest(tmp_path, sequences=1)

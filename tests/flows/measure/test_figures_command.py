@@ -136,6 +136,7 @@ def test_runs_are_made_judged_and_shown_once(tmp_path):
     assert "judged" not in again.err
 
 
+@pytest.mark.slow
 def test_strips_that_other_code_judged_are_judged_again(own_run):
     store, name, figure = own_run.store, "one", "cross-camera/side/psnr"
     point = Point(

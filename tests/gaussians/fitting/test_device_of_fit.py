@@ -110,6 +110,7 @@ def out_of_memory(times):
     return step
 
 
+@pytest.mark.slow
 def test_a_fit_without_room_leaves_its_images_on_the_cpu(world, device, monkeypatch):
     plans = []
 

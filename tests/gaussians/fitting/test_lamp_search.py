@@ -206,6 +206,7 @@ def test_levels_are_parted_where_most_is_explained():
     assert float(few.explained[0]) == 0.0
 
 
+@pytest.mark.slow
 def test_a_fit_keeps_the_lamps_it_finds_and_a_continuation_does_not_look(wall):
     scene, cameras = wall
     images = images_of(with_lamp(scene, FLASHES), cameras)

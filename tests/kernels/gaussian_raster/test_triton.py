@@ -99,6 +99,7 @@ def test_a_fit_by_triton_is_that_by_numba(monkeypatch):
         assert torch.allclose(value.cpu(), expected[name], atol=1e-4), name
 
 
+@pytest.mark.slow
 def test_every_kernel_compiles_to_machine_code_without_spilling():
     found = machine_code(90, 1, 1)
     assert set(found) == KERNELS

@@ -34,6 +34,7 @@ print(int(statistics.median(faults[3:])))  # by then the memory has grown to its
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="how glibc gives memory back")
 def test_a_view_is_painted_in_the_memory_that_the_one_before_it_freed():
     run = [sys.executable, "-c", FAULTS_OF_A_VIEW]

@@ -268,6 +268,7 @@ def test_damage_stays_in_range_and_leaves_most_of_the_image():
         assert not torch.equal(damaged, render)
 
 
+@pytest.mark.slow
 def test_a_device_learns_what_the_cpu_learns(make_pair, memory_pairs, monkeypatch):
     source = memory_pairs([make_pair(48, seed) for seed in (0, 1)])
     config = replace(SHORT, half_precision=False, steps=3, log_every_steps=1)

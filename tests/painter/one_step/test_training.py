@@ -167,6 +167,7 @@ def test_in_half_precision_what_is_trained_stays_in_float32(make_network, make_p
     assert rounded == pytest.approx(loss, rel=0.05)  # eight bits, and a step that scales by 14.6
 
 
+@pytest.mark.slow
 def test_what_was_trained_is_saved_loaded_and_trained_on(model_folder, source, tmp_path):
     config = replace(SHORT, steps=2)
     made = load_trainable(

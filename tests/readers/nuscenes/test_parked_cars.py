@@ -64,6 +64,7 @@ def record(track, global_from_world):
     return known | {"heading_rad": float(torch.atan2(*global_from_box[[1, 0], 0]))}
 
 
+@pytest.mark.slow
 def test_a_parked_car_in_two_scenes_of_a_location_is_one_asset(root, tmp_path):
     found = num_sightings(root, open_store(tmp_path / "store"))
     assert found

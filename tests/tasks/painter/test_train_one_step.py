@@ -66,6 +66,7 @@ def request(sets, config, held_back, start, **options):
     return TrainingRequest(sets=sets, config=config, held_back=held_back, start=start, **options)
 
 
+@pytest.mark.slow
 def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, store, model):
     trained = train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
     weights = weights_path(store, trained.ref)
