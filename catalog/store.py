@@ -291,9 +291,12 @@ def open_store(path: Path | str | None = None) -> Store:
         raise CatalogError(
             f"{str(root)!r}, the store: Delta tables cannot have {found[0]!r} in a path"
         )
-    if root.exists() and not root.is_dir():
-        raise CatalogError(f"the store {root} is a file, expected a folder")
-    return Store(root)
+    try:
+        if root.is_dir() or not root.exists():
+            return Store(root)
+    except OSError as error:  # a name of more than 255 bytes
+        raise CatalogError(f"the store {root} cannot be there: {error.strerror}") from None
+    raise CatalogError(f"the store {root} is a file, expected a folder")
 
 
 @lru_cache(maxsize=8)  # its connections are kept
@@ -312,12 +315,9 @@ def existing_store() -> Store:
         StorageError: there is no such bucket.
     """
     store = open_store()
-    parts = ("tables", "scenes")
-    if store.mirror is None:
-        is_there = any((store.root / name).is_dir() for name in parts)
-    else:
-        is_there = any(store.mirror.bucket.holds(name) for name in parts)
-    if not is_there:
+    mirror = store.mirror
+    holds = (lambda name: (store.root / name).is_dir()) if mirror is None else mirror.bucket.holds
+    if not any(map(holds, ("tables", "scenes"))):
         raise CatalogError(f"no store at {store.name}: `ingest` or `demo` makes one, see --store")
     return store
 

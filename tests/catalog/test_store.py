@@ -40,6 +40,11 @@ def test_a_file_in_the_place_of_the_store_is_named(tmp_path):
         open_store(tmp_path / "file")
 
 
+def test_a_name_that_no_folder_can_have_is_refused(tmp_path):
+    with pytest.raises(CatalogError, match="cannot be there: File name too long"):
+        open_store(tmp_path / ("s" * 300))
+
+
 @pytest.mark.parametrize("name", ["a%2Fb", "a%20b", "tab\tin", "new\nline", "back\\slash"])
 def test_a_path_that_tables_cannot_have_is_refused_before_anything_is_written(tmp_path, name):
     with pytest.raises(CatalogError, match="Delta tables cannot have"):
