@@ -88,5 +88,5 @@ def _write_seen(path: FollowedPath, number: int, folder: Path) -> PosedImage:
     """A view beside the recorded path, as rendered or painted."""
     view, camera = path.views[number], path.camera(number)
     name = f"{view.camera_name}_{path.trajectory.name}/{view.frame_index:04d}.png"
-    write_png(path.image(camera, view), folder / name)
+    write_png(path.shown(camera, view).rgb, folder / name)
     return PosedImage(name=name, camera=camera, timestamp_ns=view.timestamp_ns)

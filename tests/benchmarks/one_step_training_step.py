@@ -40,15 +40,14 @@ def build_training_step(
     text = torch.randn(TEXT_TOKENS, architecture.text_width, generator=generator)
     model = random_network(network, architecture=architecture, seed=_SEED, has_adapters=True)
     trainee = OneStepTrainee(model, {DEFAULT_PROMPT: text}, config)
-    state = TrainingState.start(trainee)
+    state = TrainingState.start(trainee.trained, trainee.opponent)
     batch = _random_batch(height_px, width_px, generator)
 
     def step() -> float:
         loss = trainee.learn(batch, step=state.step, share=1.0)["total"]
-        for optimiser in (state.optimiser, state.opponent_optimiser):
-            if optimiser is not None:
-                optimiser.step()
-                optimiser.zero_grad(set_to_none=True)
+        for optimiser in state.optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
         state.step += 1
         return loss
 

@@ -10,7 +10,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.one_step.architectures import build_tiny
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.config import FAST, PAPER, PRESETS
-from lidarpainter_models.painter.one_step.weights import save_trained
+from lidarpainter_models.painter.one_step.weights import Trainable, save_trained
 
 
 def test_parameters_are_sd_turbos():
@@ -51,10 +51,11 @@ def test_a_full_size_weights_file_is_under_20_mb_and_holds_every_bit(tmp_path):
 
     network = random_network(PAPER, has_adapters=True)
     path = tmp_path / "full.safetensors"
-    prompts = {name: torch.zeros(77, 1024) for name in ("clear", "foggy", "night", "rain")}
-    save_trained(
-        network, path, prompts=prompts, base="sd-turbo", mark=[], licence="x", provenance={}
+    texts = {name: torch.zeros(77, 1024) for name in ("clear", "foggy", "night", "rain")}
+    made = Trainable(
+        network=network, texts=texts, base="sd-turbo", mark=[], licence="x", provenance={}
     )
+    save_trained(made, path, licence="x", provenance={})
     assert path.stat().st_size < 20e6
     state, stored = dict(network.named_parameters()), load_file(path)
     assert all(

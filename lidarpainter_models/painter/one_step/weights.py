@@ -68,7 +68,7 @@ def save_trained(made: Trainable, path: Path, *, licence: str, provenance: dict[
         WriteError: the file cannot be written.
     """
     state = dict(made.network.named_parameters())
-    tensors = {name: state[name] for name in trained_names(made.network)}
+    tensors: dict[str, Tensor] = {name: state[name] for name in trained_names(made.network)}
     tensors |= {PROMPT + name: text for name, text in made.texts.items()}
     tensors = {name: tensor.to(stored_type(name)) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
