@@ -81,7 +81,7 @@ def assert_same_paintings(found, expected):
         for name in ("rgb", "weight"):
             mine, theirs = getattr(one.guidance, name), getattr(other.guidance, name)
             assert float((mine - theirs).abs().mean()) < ROUNDING
-        assert one.gate.is_refused == other.gate.is_refused
+        assert one.is_refused == other.is_refused
 
 
 def test_views_are_painted_on_the_device_of_their_scene(world, monkeypatch):
