@@ -54,8 +54,9 @@ def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
 
 def _gaussians(tensors: Sequence[Tensor]) -> Gaussians:
     *floats, transforms, body_index = tensors
-    rest = (_array(transforms, torch.float64), _array(body_index, torch.int32))
-    return Gaussians(*map(_array, floats), *rest)
+    arrays = [_array(tensor) for tensor in floats]
+    arrays += [_array(transforms, torch.float64), _array(body_index, torch.int32)]
+    return Gaussians._make(arrays)
 
 
 def _compiled_view(view: Camera) -> View:

@@ -111,9 +111,10 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 def _arrays(part: Part) -> Part:
     """The same named tuple of arrays, as compiled code takes it."""
-    return part._make(
+    values: list[Any] = [
         _array(value) if isinstance(value, Tensor) else np.float32(value) for value in part
-    )
+    ]
+    return type(part)(*values)
 
 
 def _lamps(lamps: scene_light.Lamps, counts: Tensor) -> _Lamps:
