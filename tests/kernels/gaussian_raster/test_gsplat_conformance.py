@@ -157,9 +157,7 @@ def test_the_adapter_draws_the_law_with_gsplats_own_lists(splats):
     scene = splats(60, seed=8, features=1)
     scene["opacity"] = scene["opacity"].clamp(max=0.98)
     gaussians, features, poses, camera = _of(scene)
-    rgb, depth_m, _, _, visible, _ = cuda.draw_with(
-        gsplat, gaussians, features, poses, camera, None
-    )
+    rgb, depth_m, _, _, visible = cuda.draw_with(gsplat, gaussians, features, poses, camera, None)
     image = render(scene, backend="reference")
     assert float((rgb - image.rgb).abs().mean()) < 1e-6
     assert float((depth_m - image.depth_m).abs().mean()) < 1e-5
