@@ -95,7 +95,8 @@ def _interrupt(number: int, _frame: FrameType | None) -> None:
 def _remember(number: int) -> None:
     _caught.append(number)
     # what breaks on the way out is no news
-    sys.unraisablehook = threading.excepthook = lambda _what: None
+    sys.unraisablehook = lambda _what: None
+    threading.excepthook = lambda _what: None
 
 
 def _end_in_time(told: int) -> None:

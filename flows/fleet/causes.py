@@ -25,7 +25,7 @@ LONGEST_REASON = 500
 
 def cause_of(error: Exception) -> tuple[Cause, str]:
     """Why an attempt ended, and one line about it."""
-    cause = next((cause for cause, fits in RULES if fits(error)), "error")
+    cause: Cause = next((cause for cause, fits in RULES if fits(error)), "error")
     text = " ".join(str(error).split())[:LONGEST_REASON]
     is_ours = isinstance(error, (LidarPainterError, CatalogError))
     name = type(error).__name__
