@@ -113,8 +113,7 @@ def export(  # noqa: PLR0913 - the options of a command
             existing_store(), run_id, row.name, request, out.absolute(), scene=scene
         )
     shown = {FIGURES.get(name, name): value for name, value in result.items()}
-    title = f"{row.name} of {result['scene']}"
-    print_result(title, result if as_json else shown, as_json=as_json)
+    print_result(f"{row.name} of {result['scene']}", result if as_json else shown, as_json=as_json)
 
 
 def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:

@@ -61,13 +61,11 @@ def stylize(  # noqa: PLR0913 - the options of a command
     if in_scene == (out is not None):
         raise ConfigError("stylize needs --out FOLDER for images, or --in-scene for a new run")
     if in_scene:
+        optional = {"--camera": camera, "--frames": frames, "--width": width, "--painter": painter}
         given = {
             "--trajectory": trajectory != RECORDED,
             "--images": images != "rendered",
-            "--camera": camera is not None,
-            "--frames": frames is not None,
-            "--width": width is not None,
-            "--painter": painter is not None,
+            **{name: value is not None for name, value in optional.items()},
             "--allow-collisions": allow_collisions,
         }
         refuse_unused("--in-scene", given)

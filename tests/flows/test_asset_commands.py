@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from commands import call, succeed
+from commands import call, refuse, succeed
 
 from lidarpainter_models.export.spz_files import read_spz
 from lidarpainter_models.gaussians.model.ply_files import read_ply
@@ -123,9 +123,7 @@ def test_only_what_has_gaussians_is_exported_under_its_ending(library, actor, tm
         (actor, "car.obj", "expected a name in .ply"),
     ):
         words = ("--format", "ply", "--out", tmp_path / out)
-        answer = call("assets", "export", asset["asset_id"], *words, store=library)
-        assert answer.code == 2
-        assert expected in answer.err
+        assert expected in refuse("assets", "export", asset["asset_id"], *words, store=library)
 
 
 def test_a_row_that_leads_out_of_the_store_is_refused(library, actor, tmp_path):
@@ -134,7 +132,7 @@ def test_a_row_that_leads_out_of_the_store_is_refused(library, actor, tmp_path):
         hostile = "../../../../etc" if column == "folder" else "../../etc"
         library.tables.merge("assets", [{**row, "asset_id": "hostile", column: hostile}])
         words = ("--format", "ply", "--out", tmp_path / "x.ply")
-        answer = call("assets", "export", "hostile", *words, store=library)
-        assert answer.code == 2
-        assert "leads out of the store" in answer.err
+        assert "leads out of the store" in refuse(
+            "assets", "export", "hostile", *words, store=library
+        )
     library.tables.delete("assets", "asset_id", ["hostile"])

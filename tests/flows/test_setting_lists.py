@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from commands import call, succeed
+from commands import refuse, succeed
 
 from flows.overrides import with_overrides
 from flows.presets import PRESETS, preset
@@ -45,9 +45,7 @@ def test_the_command_lists_a_part_or_all():
 
 
 def test_a_setting_that_is_none_is_refused():
-    answer = call("settings", "fits")
-    assert answer.code == 2
-    assert "no setting 'fits', expected one of scene, preset, split" in answer.err
+    assert "no setting 'fits', expected one of scene, preset, split" in refuse("settings", "fits")
 
 
 def test_listing_imports_nothing_heavy():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from commands import call, seen_image, succeed
+from commands import refuse, seen_image, succeed
 from tiny_street import HEIGHT_PX, WIDTH_PX
 
 PATH = ("--trajectory", "recorded", "--frames", "2:3")
@@ -24,13 +24,13 @@ def test_a_run_in_a_style_is_shown_in_it_and_leads_back(own_run, tmp_path):
     (row,) = (row for row in listed if row["run_id"] == result["run_id"])
     assert row["derived_from"] == own_run.run_id
     painted = ("--painter", "overlay", "--out", tmp_path / "painted")
-    refused = call("render", result["run_id"], *PATH, *painted, store=own_run.store)
-    assert refused.code == 2
-    assert "painters know clear days" in refused.err
+    assert "painters know clear days" in refuse(
+        "render", result["run_id"], *PATH, *painted, store=own_run.store
+    )
     twice = ("--prompt", "night", "--frames", "2:3", "--out", tmp_path / "twice")
-    refused = call("stylize", result["run_id"], *twice, store=own_run.store)
-    assert refused.code == 2
-    assert "the run is in the style night:1, and styles are put on clear days" in refused.err
+    assert "the run is in the style night:1, and styles are put on clear days" in refuse(
+        "stylize", result["run_id"], *twice, store=own_run.store
+    )
     assert not (tmp_path / "twice").exists()
 
 
@@ -39,9 +39,9 @@ def test_what_was_recorded_is_not_exported_of_a_run_in_a_style(own_run, tmp_path
     words = ("stylize", own_run.run_id, "--prompt", "night", "--in-scene", "--json")
     styled = succeed(*words, store=own_run.store).json["run_id"]
     words = ("export", styled, "--format", wanted, "--out", tmp_path / "out")
-    refused = call(*words, store=own_run.store)
-    assert refused.code == 2
-    assert f"was changed (style): export {own_run.run_id}, which it was derived" in refused.err
+    assert f"was changed (style): export {own_run.run_id}, which it was derived" in refuse(
+        *words, store=own_run.store
+    )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from commands import call, succeed
+from commands import refuse, succeed
 from prometheus_client.parser import text_string_to_metric_families
 from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
 
@@ -92,9 +92,9 @@ def test_metrics_are_read_by_their_own_parser(worked, tmp_path):
 
 def test_metrics_that_cannot_be_written_are_one_line(worked, tmp_path):
     (tmp_path / "file").touch()
-    answer = call("fleet", "status", "stub", "--metrics", tmp_path / "file/x.prom", store=worked[1])
-    assert answer.code == 2
-    assert "cannot write" in answer.err
+    assert "cannot write" in refuse(
+        "fleet", "status", "stub", "--metrics", tmp_path / "file/x.prom", store=worked[1]
+    )
 
 
 def test_the_page_says_what_happened_and_stands_alone(worked, tmp_path):
@@ -153,7 +153,7 @@ def test_a_fleet_that_nobody_has_begun_has_a_page_and_an_unknown_one_has_none(tm
     out = tmp_path / "night.html"
     succeed("fleet", "report", "--out", out, store=store)
     assert "Nobody has begun." in out.read_text("utf-8")
-    answer = call("fleet", "report", "other", "--out", tmp_path / "x.html", store=store)
-    assert answer.code == 2
-    assert "no fleet 'other'" in answer.err
+    assert "no fleet 'other'" in refuse(
+        "fleet", "report", "other", "--out", tmp_path / "x.html", store=store
+    )
     assert not (tmp_path / "x.html").exists()
