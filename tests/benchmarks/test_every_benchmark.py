@@ -51,8 +51,8 @@ def test_a_benchmark_that_makes_its_own_input_tells_figures(name, words, told):
 
 def test_ingest_is_timed_and_its_digests_are_one(tmp_path):
     log = WRITERS["pandaset"](tmp_path)
-    words = ("--dataset", log.dataset, "--sequence", log.sequence, "--runs", "1", "--serial")
-    assert run("bench_ingest.py", log.root, *words).count("frames ahead:") == 2
+    words = ("--dataset", log.dataset, "--sequence", log.sequence, "--runs", "2")
+    assert run("bench_ingest.py", log.root, *words).count("frames/s") == 2
 
 
 @pytest.mark.slow

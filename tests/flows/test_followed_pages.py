@@ -32,6 +32,7 @@ def commands_of(page):
     return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 
+@pytest.mark.slow
 def test_tutorial_ends_with_a_lane_aside(tmp_path, monkeypatch, prefect_api):  # noqa: ARG001
     from lidarpainter_models.viewing.viewer import LiveViewer
 

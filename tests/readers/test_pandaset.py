@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pickled_tables import pickled_table
 from small_pandaset import PandasetFolder
 
 from lidarpainter_models.errors import DataError
@@ -212,7 +213,7 @@ def require_columns(content):
 
 
 @pytest.mark.parametrize("as_pandas", [1, 2])
-def test_tables_of_old_and_new_pandas_are_read(pickled_table, as_pandas):
+def test_tables_of_old_and_new_pandas_are_read(as_pandas):
     require_columns(pickled_table(COLUMNS, as_pandas=as_pandas))
 
 

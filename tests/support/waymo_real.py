@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from waymo_damage import split
+from waymo_edits import split
 
 from lidarpainter_models.checks.overlay import draw_boxes
 from lidarpainter_models.geometry.transforms import invert_rigid
