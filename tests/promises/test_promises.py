@@ -35,13 +35,14 @@ def real_log(shared_folder, tmp_path_factory):
 
 def test_painting_gains_beside_the_path_and_costs_nothing_on_it(street):
     painted, unpainted = street.scores(street.painted), street.scores(street.unpainted)
-    # seeds 0, 1, 2: 0.68, 0.75, 0.84 dB; .042, .042, .039; +0.03, +0.04, +0.10 dB
-    assert beside(painted) - beside(unpainted) > 0.45
+    # seeds 0, 1, 2: 0.68, 0.75, 0.84 dB; .042, .042, .039; +0.03, +0.04, +0.10 dB. A painter that
+    # leaves each render as it is gains 0.47 dB, by the LiDAR's depth in its views
+    assert beside(painted) - beside(unpainted) > 0.55
     assert depth_beside(painted) - depth_beside(unpainted) > 0.03
     assert painted["recorded"]["psnr"] - unpainted["recorded"]["psnr"] > -0.1
     # 31.36, 31.29, 31.35 dB and 24.87, 24.92, 25.00 dB
     assert painted["recorded"]["psnr"] > 31.1
-    assert beside(painted) > 24.6
+    assert beside(painted) > 24.7
 
 
 def test_painting_at_view_time_gains_where_another_camera_looks(street):
