@@ -55,6 +55,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(words)
     fuzz = Fuzz(given.folder, random.Random(given.seed))  # noqa: S311 no secret
+    if sound := fuzz.refusal_of_the_sound_log():
+        sys.exit(f"the sound log is refused, so nothing can be held against it: {sound}")
     for number in range(given.combinations):
         for fault in fuzz.faults_of_one():
             sys.stdout.write(f"{number}: {fault}\n")
@@ -111,6 +113,11 @@ class Fuzz:
             found += self._found("path {}, proxy {}, home {}".format(*place), self.places[place])
         self.num_faults += len(found)
         return found
+
+    def refusal_of_the_sound_log(self) -> str:
+        """Why the log without anything odd is refused; empty if it is not."""
+        sound = self._log("plain", "plain", "plain")
+        return sound.refusal or sound.fault
 
     def said(self, count: int) -> str:
         """How many of what there was."""
@@ -227,7 +234,11 @@ def _fitted(scene: DrivingScene) -> Outcome:
 
 
 def _rewritten(scene: DrivingScene, store: Path, name: str, changes: Sequence[Change]) -> Path:
-    header = SceneHeader(licence="CC0", global_from_world=scene.global_from_world)
+    header = SceneHeader(
+        licence="CC0",
+        global_from_world=scene.global_from_world,
+        semantic_classes=scene.semantic_classes,
+    )
     with SceneWriter(store, "fuzz", name, header) as writer:
         for frame_index in scene.frame_indices:
             frame = read_frame(scene, frame_index)

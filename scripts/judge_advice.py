@@ -76,7 +76,11 @@ def _untold(scene: DrivingScene, store: Path, name: str) -> DrivingScene:
     """The same log, with nothing said of how its cameras read their rows."""
     path = store / "scenes" / "untold" / f"{name}-{scene.sequence}"
     if not path.is_dir():
-        header = SceneHeader(licence="CC0", global_from_world=scene.global_from_world)
+        header = SceneHeader(
+            licence="CC0",
+            global_from_world=scene.global_from_world,
+            semantic_classes=scene.semantic_classes,
+        )
         with SceneWriter(store, "untold", path.name, header) as writer:
             for frame_index in scene.frame_indices:
                 frame = read_frame(scene, frame_index)
