@@ -109,7 +109,7 @@ class Camera:
         """When an image with a timestamp was really taken."""
         return timestamp_ns + (0 if self.shutter is None else round(self.shutter.late_s * 1e9))
 
-    def read_s(self, pixels_uv: Float[Tensor, "points 2"]) -> Float[Tensor, " points"]:
+    def read_s(self, pixels_uv: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points"]:
         """How long after the middle of the image pixels are read; beyond it, as at its edge."""
         columns_s, rows_s = (0.0, 0.0) if self.shutter is None else self.shutter.across_s
         u, v = pixels_uv.unbind(-1)

@@ -6,7 +6,7 @@ own (gradients, several views) has a suite below `tests/kernels/`.
 
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,13 @@ from torch import Tensor
 
 from lidarpainter_models import kernels
 from lidarpainter_models.errors import BackendError
+from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.backends import available_backends
 from lidarpainter_models.kernels.box_owners import box_owners
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.kernels.row_motion import motion_until_read
 
 SUITES = Path(__file__).resolve().parents[1] / "kernels"
 HEIGHT_PX, WIDTH_PX = 30, 45
@@ -68,7 +70,27 @@ def random_boxes(count: int, generator: torch.Generator) -> dict[str, Any]:
     }
 
 
+def random_motion(count: int, generator: torch.Generator) -> dict[str, Any]:
+    poses = rigid_from_tangent(0.2 * torch.randn(3, 6, generator=generator)).float()
+    poses[:, 2, 3] += 6
+    rates = torch.randn(3, 3, 4, generator=generator) * torch.tensor([0.2, 0.2, 0.2, 10.0])
+    rates[2] = 0  # an absent actor
+    return {
+        "means": 4 * torch.randn(count, 3, generator=generator),
+        "rotation_wxyz": torch.randn(count, 4, generator=generator),
+        "body_index": torch.randint(0, 3, (count,), generator=generator),
+        "camera_from_body": poses[:, :3],
+        "metres_per_s": rates,
+    }
+
+
+SHUTTER = Shutter(across_s=(0.004, 0.04), twist_per_s=torch.zeros(6))
+READING = replace(
+    Camera.centred(torch.eye(4).double(), 40.0, width_px=WIDTH_PX, height_px=HEIGHT_PX),
+    shutter=SHUTTER,
+)
 CASES = {
+    "row_motion": Case(random_motion, partial(motion_until_read, camera=READING), 1e-5),
     "box_owners": Case(random_boxes, partial(box_owners, margin_m=0.2, floor_m=0.3), 0.0),
     "point_splat": Case(
         random_points, partial(splat_points, height_px=HEIGHT_PX, width_px=WIDTH_PX), 0.0

@@ -16,6 +16,7 @@ from lit_surfaces import random_scene
 from splat_drawing import SPLATS
 from torch import Tensor
 
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.box_owners import box_owners
@@ -25,6 +26,7 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, rend
 from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, pixel_terms
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.kernels.row_motion import motion_until_read
 from lidarpainter_models.kernels.scene_light import irradiance, seen_harmonics
 from lidarpainter_models.kernels.sky_texture import (
     SkyLayout,
@@ -111,6 +113,22 @@ def _boxes(backend: Backend, device: torch.device) -> list[Tensor]:
         backend=backend,
     )
     return [owners]
+
+
+def _motion(backend: Backend, device: torch.device) -> list[Tensor]:
+    draw, camera = Draw(device), camera_at(0.0)
+    shutter = Shutter(across_s=(0.0, 0.04), twist_per_s=torch.zeros(6))
+    poses = camera.camera_from_world.float().expand(3, 4, 4)[:, :3]
+    moved = motion_until_read(
+        4 * draw.normal(5000, 3) + torch.tensor([10.0, 0.0, 0.0], device=device),
+        draw.normal(5000, 4),
+        draw.below(3, 5000),
+        poses,
+        draw.normal(3, 3, 4) * torch.tensor([0.1, 0.1, 0.1, 10.0], device=device),
+        replace(camera, shutter=shutter),
+        backend=backend,
+    )
+    return list(moved)
 
 
 def _splat(backend: Backend, device: torch.device) -> list[Tensor]:
@@ -302,6 +320,7 @@ TRIALS = {
     "pixel_losses": Trial(_pixel_terms, 1e-4),
     "point_blend": Trial(_blend, 1e-3),
     "point_splat": Trial(_splat, 2e-3),
+    "row_motion": Trial(_motion, 1e-4),
     "scene_light": Trial(_light, 1e-3),
     "sky_texture": Trial(_sky, 1e-3),
     "sparse_adam": Trial(_adam, 1e-4),

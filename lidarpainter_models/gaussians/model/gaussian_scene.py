@@ -14,7 +14,6 @@ from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.drawing import SceneRender
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.rolling_shutter import MOST_GROWTH
 from lidarpainter_models.gaussians.model.scene_rendering import (
     DrawableScene,
     PosedScene,
@@ -26,6 +25,7 @@ from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.gaussians.model.styling.styled_gaussians import StyledGaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
+from lidarpainter_models.kernels.row_motion import MOST_GROWTH
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
