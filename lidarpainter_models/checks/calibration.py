@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpainter_models.checks.depth_edges import EdgeImage, SceneEdges, edge_scores, reduced
+from lidarpainter_models.checks.depth_edges import EdgeImage, SceneEdges, edge_scores
 from lidarpainter_models.checks.verdicts import Verdict
 
 MAX_TURN_DEG = 0.6
@@ -103,20 +103,26 @@ def check_calibration(
     return "ok", detail
 
 
+def why_untold(edges: SceneEdges, name: str) -> str | None:
+    """Why edges cannot tell how a camera looks, None if they can."""
+    if name in edges.blank:
+        return "its images show nothing"
+    images = edges.images[name]
+    # of the coarsest image that is looked at
+    px_per_deg = min((image.camera.fx_px for image in images), default=0.0) * math.radians(1.0)
+    if images and px_per_deg < _MIN_PX_PER_DEG:
+        return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
+    num_points = sum(len(points) for image in images for points, _ in image.points.values())
+    if num_points < MIN_EDGE_POINTS or len(images) < MIN_IMAGES:
+        return f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"
+    return None
+
+
 def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
     """Whether a camera is wrong, unsure, sound or untold, and what its edges and images say."""
-    if name in edges.blank:
-        return "untold", "cannot be told (its images show nothing)"
-    # of the coarsest image that is looked at
-    focal_px = min(reduced(view.camera).fx_px for view in edges.scene.views_of(name))
-    px_per_deg = focal_px * math.radians(1.0)
-    if px_per_deg < _MIN_PX_PER_DEG:
-        coarse = f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
-        return "untold", f"cannot be told ({coarse})"
+    if reason := why_untold(edges, name):
+        return "untold", f"cannot be told ({reason})"
     turn = best_turn(edges.images[name])
-    if turn is None:
-        few = f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"
-        return "untold", f"cannot be told ({few})"
     if not turn.is_wrong:
         return "unsure" if turn.peak < MIN_PEAK else "sound", str(turn)
     agreed = agrees(name, turn)
@@ -127,11 +133,8 @@ def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
     return "sound", f"{turn} by edges alone: not believed, its images in motion do not agree"
 
 
-def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
-    """The turn of a camera that puts depth edges on image edges; None where none can be told."""
-    num_points = sum(len(points) for image in images for points, _ in image.points.values())
-    if num_points < MIN_EDGE_POINTS or len(images) < MIN_IMAGES:
-        return None
+def best_turn(images: Sequence[EdgeImage]) -> CameraTurn:
+    """The turn of a camera that puts depth edges on image edges."""
     turns_deg = np.stack(np.meshgrid(_TURNS_DEG, _TURNS_DEG, 0.0, indexing="ij"), axis=-1)
     plane = edge_scores(images, turns_deg.reshape(-1, 3)).reshape(turns_deg.shape[:2])
     row, column = np.unravel_index(plane.argmax(), plane.shape)

@@ -106,7 +106,7 @@ def _edge_images(
     found = []
     for view in scene.views_of(camera_name):
         if view.frame_index in edges:
-            camera = reduced(view.camera)
+            camera = _reduced(view.camera)
             size = camera.width_px, camera.height_px
             rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
             found.append(
@@ -120,7 +120,7 @@ def _edge_images(
     return found
 
 
-def reduced(camera: Camera) -> Camera:
+def _reduced(camera: Camera) -> Camera:
     """The camera of the image that is looked at."""
     share = min(1.0, _MAX_WIDTH_PX / camera.width_px)
     return camera.resized(

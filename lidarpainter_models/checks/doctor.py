@@ -24,8 +24,8 @@ from lidarpainter_models.checks.actors import (
 from lidarpainter_models.checks.box_places import check_box_places
 from lidarpainter_models.checks.calibration import Agrees, check_calibration
 from lidarpainter_models.checks.depth_edges import SceneEdges
+from lidarpainter_models.checks.image_places import check_image_places
 from lidarpainter_models.checks.pictures import check_pictures
-from lidarpainter_models.checks.swapped_images import check_swapped_images
 from lidarpainter_models.checks.sweeps import (
     check_clear_air,
     check_coverage,
@@ -87,7 +87,7 @@ def check_scene(
         ("clear air", check_clear_air, has_lidar),
         ("points in images", check_coverage, has_lidar),
         ("camera calibration", lambda _: check_calibration(edges, agrees), has_lidar),
-        ("cameras in their place", lambda _: check_swapped_images(edges), has_lidar),
+        ("cameras in their place", lambda _: check_image_places(edges), has_lidar),
         ("boxes hold points", check_box_points, has_lidar),
         ("boxes around points", check_box_places, has_lidar),
         ("boxes point ahead", check_box_axes, True),

@@ -118,10 +118,9 @@ class FollowedPath:
         other = self._fitted_views.get(view.frame_index)
         if other is None:
             return camera
-        found_from_logged = (
-            scene.refined_camera(other).world_from_camera @ other.camera.camera_from_world
+        return scene.cameras.riding(
+            camera, view.timestamp_ns, other.camera, other.key, other.timestamp_ns
         )
-        return camera.at(found_from_logged @ camera.world_from_camera)
 
     @cached_property
     def _fitted_views(self) -> dict[int, RecordedView]:

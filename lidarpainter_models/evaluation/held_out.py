@@ -1,8 +1,9 @@
 """Held-out views of a scene, at recorded poses, at interpolated poses, and beside the path.
 
 No image and no sweep of a held-out frame was used for fitting. `interpolated` poses come from
-the refined training poses around the frame, so no test image enters them; `recorded` poses are
-the log's own. The two are reported side by side and never mixed.
+the refined training poses around the frame and from where its own sweep says that the car was
+(`lidar.sweep_registration`), so no test image enters them; `recorded` poses are the log's own. The
+two are reported side by side and never mixed.
 """
 
 from collections.abc import Sequence

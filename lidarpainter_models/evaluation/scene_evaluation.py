@@ -137,7 +137,7 @@ def score_geometry(
     """
     moves = {shift.name: shift for shift in (Shift(), *shifts)}
     scores: dict[str, list[DepthScores]] = {name: [] for name in moves}
-    lidar = FramePoints(held_out.scene)
+    lidar = FramePoints(held_out.scene.corrected(fitted.cameras.path))
 
     def scored(seen: tuple[RecordedView, Float[Tensor, "points 3"]]) -> dict[str, DepthScores]:
         view, points = seen

@@ -25,7 +25,6 @@ from lidarpainter_models.evaluation.view_scores import Renderer
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import (
-    invert_rigid,
     rigid_from_tangent,
     rotation_from_vector,
 )
@@ -305,10 +304,11 @@ def strip_views(
 
     The fitted camera stands where the fit found it: at its own pose in training frames, between
     its neighbours' in others. The judging camera, at fit size, rides on the same rig: it stands
-    where the log says, moved as the fit moved the other camera, for the jitter of logged poses is
-    the rig's. Frames that one of the two lacks, or that have no sweep, are left out.
+    where the log says, moved as the fit moved the other camera (`CameraCorrections.riding`). Frames
+    that one of the two lacks, or that have no sweep, are left out.
     """
-    scene, lidar = held_out.scene, FramePoints(held_out.scene)
+    scene = held_out.scene
+    lidar = FramePoints(scene.corrected(fitted.cameras.path))
     judging = {view.frame_index: view for view in scene.views_of(judging_camera)}
     fitting = {view.frame_index: view for view in scene.views_of(fitted_camera)}
     views = []
@@ -318,9 +318,13 @@ def strip_views(
         own, other = judging[frame], fitting[frame]
         logged = fit_camera(other, held_out.observation)
         found = fitted.refined_camera(other, logged)
-        found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
-        camera = fit_camera(own, held_out.observation)
-        camera = camera.refined(found_from_logged @ camera.world_from_camera)
+        camera = fitted.cameras.riding(
+            fit_camera(own, held_out.observation),
+            own.timestamp_ns,
+            logged,
+            other.key,
+            other.timestamp_ns,
+        )
         views.append(
             StripView(
                 camera=camera,

@@ -1,7 +1,7 @@
 """Read everything that a fit needs of a scene, each image once.
 
 Only training views and the sweeps of training frames enter; where these tell too little of the
-street, points come from the images.
+street, points come from the images. All sweeps tell where the car drove (`sweep_registration`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +22,7 @@ from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, v
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
+from lidarpainter_models.lidar.sweep_registration import register_sweeps
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.image_points import points_from_images
 from lidarpainter_models.observations.own_body import on_grid, own_bodies
@@ -30,6 +31,7 @@ from lidarpainter_models.observations.sparse_lidar import LEAST_TOLD, completed,
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit
 
@@ -67,6 +69,9 @@ def _prepared(
     progress: Callable[[int, int], None],
 ) -> SceneObservations:
     """`prepare_observations` of a split that has training views."""
+    path = register_sweeps(scene) if config.registers_sweeps else EgoCorrections.none()
+    scene, by_index = scene.corrected(path), [view.index for view in split.train]
+    split = replace(split, train=tuple(scene.views[index] for index in by_index))
     bodies = own_bodies(scene, split.train)
     faults = find_faults(scene, split.train, bodies) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
@@ -104,6 +109,7 @@ def _prepared(
         ),
         lidar_map=lidar_map,
         tracks=tuple(track for track in scene.tracks if track.is_moving),
+        path=path,
         faults=faults,
         own_bodies=hidden,
         is_estimated=is_estimated,

@@ -11,6 +11,9 @@ class ObservationConfig:
 
     width_px: int = 480
     """Fit width; the height keeps each camera's aspect ratio. Narrower recordings keep theirs."""
+    registers_sweeps: bool = True
+    """Find where the car drove by laying its LiDAR sweeps onto one another: recorded poses lack how
+    it pitches and rolls."""
     corrects_cameras: bool = False
     """Find late, turned and slowly read cameras and correct them before the fit. Off: on a real log
     without such faults it believed in a readout and cost the held-out views 0.4 dB."""

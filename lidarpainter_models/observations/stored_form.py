@@ -10,6 +10,7 @@ from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import faults_from_records
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.stored_tracks import COLUMNS as TRACK_COLUMNS
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
@@ -30,6 +31,7 @@ def observations_to_arrays(
         [lidar_map.street, *(lidar_map.actors[name] for name in actor_ids)]
     ):
         arrays |= {f"map.{index}.{name}": value for name, value in part.to_arrays().items()}
+    arrays |= {f"path.{name}": value for name, value in observations.path.tensors().items()}
     bodies = observations.own_bodies
     arrays |= {f"own_body.{name}": body.contiguous() for name, body in bodies.items()}
     records = []
@@ -94,6 +96,13 @@ def observations_from_arrays(
             street=street, actors=dict(zip(metadata["map_actors"], actors, strict=True))
         ),
         tracks=tracks,
+        path=EgoCorrections.from_tensors(
+            {
+                name.removeprefix("path."): value
+                for name, value in arrays.items()
+                if name.startswith("path.")
+            }
+        ),
         faults=faults_from_records(metadata.get("faults", {})),
         own_bodies=bodies,
         is_estimated=metadata.get("is_estimated", False),

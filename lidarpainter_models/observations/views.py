@@ -14,6 +14,7 @@ from lidarpainter_models.devices import on_device
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.scenes.camera_faults import CameraFault
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -114,6 +115,8 @@ class SceneObservations:
     lidar_map: LidarMap
     tracks: tuple[ActorTrack, ...]
     """Moving actors only."""
+    path: EgoCorrections = field(default_factory=EgoCorrections.none)
+    """Where the car drove beside what was recorded; views, map and tracks are moved there."""
     faults: Mapping[str, CameraFault] = field(default_factory=dict)
     """What was wrong about the cameras' recordings; the views are corrected already."""
     own_bodies: Mapping[str, Bool[Tensor, "height width"]] = field(default_factory=dict)

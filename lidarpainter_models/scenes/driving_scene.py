@@ -4,6 +4,7 @@ World: x forward, y left, z up, origin at the first ego pose. A `DrivingScene` i
 tables are in memory, images and points are read when asked for.
 """
 
+import copy
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,8 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
-from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.geometry.transforms import rigid_from_tangent, transform_points
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.own_boxes import own_places, without_own_boxes
 from lidarpainter_models.scenes.records import (
@@ -69,6 +71,8 @@ class DrivingScene:
         self.frame_indices: tuple[int, ...] = tuple(frames["frame_index"].to_pylist())
         self.frame_timestamps_ns = torch.tensor(frames["timestamp_ns"].to_pylist())
         self.world_from_ego: Float[Tensor, "frames 4 4"] = _poses(frames, "world_from_ego")
+        self.corrections = EgoCorrections.none()
+        """What `corrected` has moved; nothing of a scene as it was opened."""
         self._read_tables()
 
     @classmethod
@@ -146,7 +150,10 @@ class DrivingScene:
     def read_column(self, sweep: Sweep, name: str) -> Shaped[Tensor, "points *_"]:
         """One field of `read_sweep`, for whoever needs no other."""
         array = _POINT_COLUMNS[name]
-        return torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
+        values = torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
+        if name == "xyz_m" and len(self.corrections):
+            return transform_points(self.corrections.at(sweep.timestamp_ns).to(values), values)
+        return values
 
     def measured_ns(self, sweep: Sweep) -> Int[Tensor, " points"]:
         """When each point of a sweep was measured."""
@@ -184,6 +191,33 @@ class DrivingScene:
             for sweep in self._sweeps_required(frame_index)
         ]
         return torch.from_numpy(np.concatenate(parts))
+
+    def corrected(self, corrections: EgoCorrections) -> "DrivingScene":
+        """The same log with everything moved to where it was, for a scene as it was opened.
+
+        Cameras, sweeps, their points, boxes and the car itself are; images are the same.
+        """
+        if not len(corrections):
+            return self
+        moved = copy.copy(self)
+        moved.corrections = corrections
+        times_ns = self.frame_timestamps_ns.tolist()
+        moved.world_from_ego = (
+            torch.stack([corrections.at(time_ns) for time_ns in times_ns]) @ self.world_from_ego
+        )
+        moved.views = tuple(
+            replace(view, camera=corrections.of_camera(view.camera, view.timestamp_ns))
+            for view in self.views
+        )
+        moved.sweeps = tuple(
+            replace(
+                sweep,
+                world_from_lidar=corrections.at(sweep.timestamp_ns) @ sweep.world_from_lidar,
+            )
+            for sweep in self.sweeps
+        )
+        moved.tracks = tuple(map(corrections.of_track, self.tracks))
+        return moved
 
     def verify_content(self) -> None:
         """Read the whole scene and compare it with its digests (SceneError where it differs)."""

@@ -1,5 +1,6 @@
 """Bring a stored scene into the form that a fit reads."""
 
+import math
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -51,6 +52,7 @@ def _build(
         "num_test_views": len(views.test),
         "num_tracks": len(observations.tracks),
         "num_street_points": len(observations.lidar_map.street.xyz_m),
+        "median_turn_deg": math.degrees(observations.path.median_turn_rad),
         "camera_faults": [
             f"{name} {fault}; corrected" for name, fault in observations.faults.items()
         ],

@@ -125,6 +125,7 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
             observations.faults,
             observations.own_bodies,
+            observations.path,
         ),
         exposure=exposure,
     )

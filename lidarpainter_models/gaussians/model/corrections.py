@@ -21,6 +21,7 @@ from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.camera_faults import CameraFault
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.records import ViewKey
 
 GAIN_KNOTS_NS = 1_000_000_000
@@ -41,6 +42,8 @@ class CameraCorrections:
     """What was found wrong before the fit; `recorded_world_from_camera` is without it."""
     own_bodies: Mapping[str, Bool[Tensor, "height width"]] = field(default_factory=dict)
     """Where cameras show the recording car itself, at fit size, on the CPU."""
+    path: EgoCorrections = field(default_factory=EgoCorrections.none)
+    """Where the car drove; `recorded_world_from_camera` is as if it had been recorded."""
 
     @classmethod
     def none(
@@ -50,6 +53,7 @@ class CameraCorrections:
         recorded_world_from_camera: Float[Tensor, "views 4 4"],
         faults: Mapping[str, CameraFault] | None = None,
         own_bodies: Mapping[str, Bool[Tensor, "height width"]] | None = None,
+        path: EgoCorrections | None = None,
     ) -> "CameraCorrections":
         """Nothing corrected yet."""
         names = tuple(sorted({name for _, name in keys}))
@@ -62,6 +66,7 @@ class CameraCorrections:
             camera_tangent=torch.zeros(len(names), 6, dtype=torch.float64),
             faults=faults or {},
             own_bodies=own_bodies or {},
+            path=path or EgoCorrections.none(),
         )
 
     @cached_property
@@ -103,6 +108,7 @@ class CameraCorrections:
         same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
         """
         row, camera_name = self.row_of(key), key[1]
+        camera = self.path.of_camera(camera, timestamp_ns)
         if camera_name in self.faults:
             camera = self.faults[camera_name].corrected(camera)
         if row is not None:
@@ -113,6 +119,26 @@ class CameraCorrections:
             return camera
         pose = track.pose_at(0, timestamp_ns * 1e-9, camera.world_from_camera.double())
         return camera.refined(pose)
+
+    def riding(
+        self, camera: Camera, timestamp_ns: int, other: Camera, key: ViewKey, other_ns: int
+    ) -> Camera:
+        """A recorded camera that no fit saw, on the rig of one that a fit saw.
+
+        It stands where the log and the sweeps say, moved as the fit moved the other camera: what is
+        left of the jitter of logged poses is the rig's.
+
+        Args:
+            camera: as recorded.
+            timestamp_ns: of its image.
+            other: the camera that the fit saw, as recorded.
+            key: of the view of the other camera.
+            other_ns: the timestamp of that view.
+        """
+        found = self.refined(other, key, other_ns).world_from_camera.double()
+        logged = self.path.of_camera(other, other_ns).camera_from_world.double()
+        own = self.path.of_camera(camera, timestamp_ns)
+        return own.refined(found @ logged @ own.world_from_camera.double())
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything to be stored besides keys and names."""

@@ -16,6 +16,7 @@ from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.scene_style import style_from_arrays
 from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
 from lidarpainter_models.scenes.camera_faults import faults_from_records
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
 SCHEMA = 1
@@ -36,6 +37,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         },
         "tracks": track_arrays,
         "cameras": cameras.tensors(),
+        "path": cameras.path.tensors(),
         "own_body": dict(cameras.own_bodies),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
         "bending": vars(scene.actors.bending),
@@ -95,6 +97,7 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
                 camera_names=tuple(metadata["camera_names"]),
                 faults=faults_from_records(metadata.get("camera_faults", {})),
                 own_bodies=groups.get("own_body", {}),
+                path=EgoCorrections.from_tensors(groups.get("path", {})),
                 **groups["cameras"],
             ),
             exposure=_exposure(groups["exposure"], metadata["exposure_camera_names"]),

@@ -8,6 +8,7 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.scenes.camera_faults import CameraFault
+from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 
 
 def two_cameras():
@@ -34,6 +35,47 @@ def test_camera_without_training_views_stays_as_recorded():
     camera = camera_at(0.5)
     found = cameras.refined(camera, (0, "back"), 0)
     assert found is camera
+
+
+def rising(times_ns=(0, 100_000_000)):
+    """Poses that recorded nothing of how the car rose by half a metre and turned."""
+    tangent = torch.zeros(2, 6, dtype=torch.float64)
+    tangent[1, 2], tangent[1, 5] = 0.01, 0.5
+    return EgoCorrections(
+        times_ns=torch.tensor(times_ns), centre_m=torch.zeros(2, 3).double(), tangent=tangent
+    )
+
+
+def test_a_held_out_view_stands_where_its_sweep_says():
+    path = rising()
+    cameras = two_cameras()
+    poses = [
+        path.at(time_ns) @ pose
+        for time_ns, pose in zip(
+            cameras.timestamps_ns.tolist(), cameras.recorded_world_from_camera, strict=True
+        )
+    ]
+    cameras = replace(cameras, recorded_world_from_camera=torch.stack(poses), path=path)
+    camera = camera_at(0.5)
+    found = cameras.refined(camera, (7, "front"), 50_000_000).world_from_camera
+    expected = path.at(50_000_000) @ camera.world_from_camera
+    assert float(expected[2, 3]) == pytest.approx(1.25)
+    torch.testing.assert_close(found, expected)
+    trained = cameras.refined(camera, (1, "front"), 100_000_000).world_from_camera
+    torch.testing.assert_close(trained, poses[1])
+
+
+def test_a_camera_that_no_fit_saw_rides_with_one_that_it_saw():
+    cameras = replace(two_cameras(), path=rising())
+    seen, other = camera_at(0.5), camera_at(3.0)
+    alone = cameras.riding(other, 50_000_000, seen, (7, "front"), 50_000_000)
+    torch.testing.assert_close(
+        alone.world_from_camera, cameras.refined(other, (7, "back"), 50_000_000).world_from_camera
+    )
+    cameras.camera_tangent[0, 3:] = torch.tensor([0.0, 0.2, 0.0]).double()  # down
+    moved = cameras.riding(other, 50_000_000, seen, (7, "front"), 50_000_000)
+    lift_m = (moved.world_from_camera - alone.world_from_camera)[2, 3]
+    assert float(lift_m) == pytest.approx(-0.2, abs=0.03)
 
 
 def test_constant_of_a_camera_reaches_its_other_times():

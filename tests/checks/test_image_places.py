@@ -1,0 +1,32 @@
+"""Images that were turned over or mirrored are said to be, and sound ones are not."""
+
+import pytest
+
+from lidarpainter_models.checks.depth_edges import SceneEdges
+from lidarpainter_models.checks.image_places import check_image_places
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
+
+STREET = SyntheticStreetConfig(
+    seed=11, num_frames=8, width_px=240, height_px=135, cameras=DEFAULT_CAMERAS[:1]
+)
+OVER = {"turned upside down": (0, 1), "mirrored": (1,), "flipped": (0,)}
+
+
+@pytest.fixture
+def street(tmp_path):
+    return DrivingScene.open(write_street(STREET, tmp_path))
+
+
+def test_sound_images_stand_in_their_place(street):
+    assert check_image_places(SceneEdges(street))[0] == "ok"
+
+
+@pytest.mark.parametrize("way", OVER)
+def test_images_turned_over_are_said(way, street, monkeypatch):
+    read = street.read_image
+    monkeypatch.setattr(street, "read_image", lambda view: read(view).flip(*OVER[way]))
+    verdict, said = check_image_places(SceneEdges(street))
+    assert verdict == "fail"
+    assert f"{street.camera_names[0]}'s look {way}" in said
