@@ -70,8 +70,7 @@ def _prepared(
 ) -> SceneObservations:
     """`prepare_observations` of a split that has training views."""
     path = register_sweeps(scene) if config.registers_sweeps else EgoCorrections.none()
-    scene, by_index = scene.corrected(path), [view.index for view in split.train]
-    split = replace(split, train=tuple(scene.views[index] for index in by_index))
+    scene, split = scene.corrected(path), replace(split, train=path.of_views(split.train))
     bodies = own_bodies(scene, split.train)
     faults = find_faults(scene, split.train, bodies) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]

@@ -205,10 +205,7 @@ class DrivingScene:
         moved.world_from_ego = (
             torch.stack([corrections.at(time_ns) for time_ns in times_ns]) @ self.world_from_ego
         )
-        moved.views = tuple(
-            replace(view, camera=corrections.of_camera(view.camera, view.timestamp_ns))
-            for view in self.views
-        )
+        moved.views = corrections.of_views(self.views)
         moved.sweeps = tuple(
             replace(
                 sweep,

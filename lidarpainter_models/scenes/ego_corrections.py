@@ -4,7 +4,7 @@ Recorded poses come from a filter over GNSS, wheels and inertia, which smooths a
 pitches and rolls on its springs. World: z up; metres, radians, float64.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 
@@ -59,6 +60,12 @@ class EgoCorrections:
             return camera
         return replace(
             camera, world_from_camera=self.at(timestamp_ns) @ camera.world_from_camera.double()
+        )
+
+    def of_views(self, views: Iterable[RecordedView]) -> tuple[RecordedView, ...]:
+        """Recorded views with their cameras where they were."""
+        return tuple(
+            replace(view, camera=self.of_camera(view.camera, view.timestamp_ns)) for view in views
         )
 
     def of_track(self, track: ActorTrack) -> ActorTrack:

@@ -72,6 +72,7 @@ class ToyStreet(DrivingScene):
         self.camera_names = tuple(self.camera_gains)
         times_s = [0.1 * frame for frame in range(num_frames)]
         self.frame_indices = tuple(range(num_frames))
+        self.frame_timestamps_ns = torch.tensor([round(t * 1e9) for t in times_s])
         self.world_from_ego = torch.eye(4, dtype=torch.float64).expand(num_frames, 4, 4)
         self.tracks = (
             ActorTrack(
