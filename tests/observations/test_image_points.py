@@ -1,7 +1,6 @@
 """A log without LiDAR gets its points from training images."""
 
 import pytest
-import torch
 from toy_street import CAR_SIZE_M, ToyStreet
 from wall_drive import WALL_X_M, WallDrive
 
