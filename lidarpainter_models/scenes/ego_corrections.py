@@ -4,6 +4,7 @@ Recorded poses come from a filter over GNSS, wheels and inertia, which smooths a
 pitches and rolls on its springs. World: z up; metres, radians, float64.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,9 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
+
+LEAST_TOLD_DEG = 0.01
+"""A third of a pixel of an image with 2,000 pixels of focal length."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,6 +40,16 @@ class EgoCorrections:
 
     def __len__(self) -> int:
         return len(self.times_ns)
+
+    def in_words(self) -> list[str]:
+        """What is worth telling of it, in sentences; nothing where poses were as good as right."""
+        turn_deg = math.degrees(self.median_turn_rad)
+        if turn_deg < LEAST_TOLD_DEG:
+            return []
+        return [
+            f"The LiDAR sweeps say that the car was turned by {turn_deg:.2f} degrees (median) from "
+            "its recorded poses; corrected."
+        ]
 
     def at(self, timestamp_ns: int) -> Float[Tensor, "4 4"]:
         """What moves something recorded at a time to where it was; before and after as at the ends.

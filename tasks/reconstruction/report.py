@@ -135,6 +135,7 @@ def _pictures(
         actor_gaussians=dict(zip(names, counts, strict=True)),
         found=[
             *said,
+            *fitted.cameras.path.in_words(),
             *(f"{name} {fault}; corrected." for name, fault in fitted.cameras.faults.items()),
             *(in_words(name, body) for name, body in fitted.cameras.own_bodies.items()),
             *fitted.blinking.in_words(names),

@@ -65,6 +65,15 @@ def test_a_held_out_view_stands_where_its_sweep_says():
     torch.testing.assert_close(trained, poses[1])
 
 
+def test_what_sweeps_say_is_told_where_it_matters():
+    path = rising()
+    assert path.in_words() == []
+    tangent = path.tangent.clone()
+    tangent[:, 0] = 2e-3
+    (said,) = replace(path, tangent=tangent).in_words()
+    assert "turned by 0.11 degrees (median)" in said
+
+
 def test_a_camera_that_no_fit_saw_rides_with_one_that_it_saw():
     cameras = replace(two_cameras(), path=rising())
     seen, other = camera_at(0.5), camera_at(3.0)
