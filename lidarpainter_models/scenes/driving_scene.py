@@ -201,10 +201,7 @@ class DrivingScene:
             return self
         moved = copy.copy(self)
         moved.corrections = corrections
-        times_ns = self.frame_timestamps_ns.tolist()
-        moved.world_from_ego = (
-            torch.stack([corrections.at(time_ns) for time_ns in times_ns]) @ self.world_from_ego
-        )
+        moved.world_from_ego = corrections.at_times(self.frame_timestamps_ns) @ self.world_from_ego
         moved.views = corrections.of_views(self.views)
         moved.sweeps = tuple(
             replace(

@@ -56,16 +56,19 @@ class EgoCorrections:
 
         Points, and poses from the left, are multiplied by it.
         """
+        return self.at_times(torch.tensor([timestamp_ns]))[0]
+
+    def at_times(self, timestamps_ns: Int[Tensor, " queries"]) -> Float[Tensor, "queries 4 4"]:
+        """`at` many times."""
         if not len(self):
-            return torch.eye(4, dtype=torch.float64)
-        after = int(torch.searchsorted(self.times_ns, timestamp_ns))
-        before, after = max(after - 1, 0), min(after, len(self) - 1)
-        span_ns = max(int(self.times_ns[after] - self.times_ns[before]), 1)
-        share = min(max((timestamp_ns - int(self.times_ns[before])) / span_ns, 0.0), 1.0)
-        tangent = torch.lerp(self.tangent[before], self.tangent[after], share)
+            return torch.eye(4, dtype=torch.float64).repeat(len(timestamps_ns), 1, 1)
+        after = torch.searchsorted(self.times_ns, timestamps_ns).clamp(max=len(self) - 1)
+        before = (after - 1).clamp(min=0)
+        span_ns = (self.times_ns[after] - self.times_ns[before]).clamp(min=1)
+        share = ((timestamps_ns - self.times_ns[before]).double() / span_ns).clamp(0, 1)[:, None]
+        moved = rigid_from_tangent(torch.lerp(self.tangent[before], self.tangent[after], share))
         centre_m = torch.lerp(self.centre_m[before], self.centre_m[after], share)
-        moved = rigid_from_tangent(tangent)
-        moved[:3, 3] += centre_m - moved[:3, :3] @ centre_m
+        moved[:, :3, 3] += centre_m - (moved[:, :3, :3] @ centre_m[..., None])[..., 0]
         return moved
 
     def of_camera(self, camera: Camera, timestamp_ns: int) -> Camera:
@@ -84,7 +87,7 @@ class EgoCorrections:
 
     def of_track(self, track: ActorTrack) -> ActorTrack:
         """An actor, whose boxes were drawn around the points of each time."""
-        moved = torch.stack([self.at(time_ns) for time_ns in track.timestamps_ns.tolist()])
+        moved = self.at_times(track.timestamps_ns)
         return replace(track, world_from_box=moved @ track.world_from_box.double())
 
     @property
