@@ -26,7 +26,7 @@ class ViewParameters(BaseModel):
     preset: str
     """Name of the preset these parameters started from."""
     split: str = "alternate"
-    """Which frames train and which judge: `alternate`, `forward:17:8`, `all`."""
+    """Which frames train and which judge: `alternate`, `linspace`, `forward:17:8`, `all`."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras to train on and to judge; None takes all."""
     observation: ObservationConfig

@@ -37,8 +37,9 @@ up: Metres above the path at which views are painted, such as 1.5; at most 8. Th
 rounds: Number of rounds, each one painting and the continued fit after it; 0 paints nothing. The
   preset's if absent.
 split: Which frames are fitted and which are held out for scoring: alternate (every second one is
-  held out), forward:17:8 (every second of the first 17 is fitted, the last 8 are held out), or all
-  (none is held out). The preset's if absent.
+  held out), linspace (half of them at even steps are fitted, the last one too: the protocol of
+  neurad-studio), forward:17:8 (every second of the first 17 is fitted, the last 8 are held out), or
+  all (none is held out). The preset's if absent.
 seed: Number that decides in which order the fit sees its views.
 memory: The maximum memory of the process that fits on a CPU, such as 6GB or 800MB; the scene gets
   fewer Gaussians where it would take more. No limit if absent.

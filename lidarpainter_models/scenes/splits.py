@@ -2,6 +2,8 @@
 
 A spec is one of
 - `alternate`: every second frame trains, the others test (the paper's protocol);
+- `linspace`: half of the frames, at even steps from the first to the last, train (neurad-studio's
+  protocol on PandaSet: 0, 2 .. 76, 79 of 80);
 - `forward:N:M`: every second of the first N frames trains, the last M frames test, farther along;
 - `all`: every frame trains, nothing is held out.
 
@@ -15,6 +17,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -33,7 +37,7 @@ class Keyed(Protocol):
 Item = TypeVar("Item")
 View = TypeVar("View", bound=Keyed)
 
-SPECS = "alternate, forward:N:M or all"
+SPECS = "alternate, linspace, forward:N:M or all"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +132,12 @@ def split_frames(
     kind, *numbers = spec.split(":")
     if kind == "alternate" and not numbers:
         train, test = _every_second(frames, seen_by)
+    elif kind == "linspace" and not numbers:
+        trains = set(np.linspace(0, len(frames) - 1, len(frames) // 2).astype(int).tolist())
+        train, test = (
+            tuple(frame for place, frame in enumerate(frames) if (place in trains) == is_train)
+            for is_train in (True, False)
+        )
     elif kind == "all" and not numbers:
         train, test = frames, ()
     elif kind == "forward" and len(numbers) == 2 and all(part.isdigit() for part in numbers):

@@ -119,7 +119,7 @@ def refused(words, expected, place):
             "--time-limit '0min': expected a time such as 10min, in s, min, h",
         ),
         ((*TOY, "--rounds", "-1"), "rounds: Input should be greater than or equal to 0"),
-        ((*TOY, "--split", "nonsense"), "expected alternate, forward:N:M or all"),
+        ((*TOY, "--split", "nonsense"), "expected alternate, linspace, forward:N:M or all"),
         ((*TOY, "--split", "forward:0:0"), "forward:0:0"),
         ((*TOY, "--train-cameras", "roof"), "no camera 'roof'; it has front"),
         ((*TOY, "--shift", "200"), "at most 8 metres from the recorded path"),

@@ -12,6 +12,12 @@ def test_alternate_frames_train_and_test():
     assert test == tuple(range(1, 28, 2))
 
 
+def test_linspace_is_the_split_of_neurad_studio():
+    train, test = split_frames(range(80), "linspace")
+    assert (train[:3], train[-3:]) == ((0, 2, 4), (74, 76, 79))
+    assert (test[0], test[-3:], len(test)) == (1, (75, 77, 78), 40)
+
+
 def test_forward_split_trains_behind_and_tests_ahead():
     train, test = split_frames(range(28), "forward:17:8")
     assert train == (0, 2, 4, 6, 8, 10, 12, 14, 16)
@@ -65,7 +71,7 @@ def test_positions_count_and_not_frame_numbers():
     "spec", ["", "odd", "alternate:2", "forward", "forward:17", "forward:a:b", "forward:-1:3"]
 )
 def test_unknown_spec_names_the_known_ones(spec):
-    with pytest.raises(ConfigError, match="expected alternate, forward:N:M or all"):
+    with pytest.raises(ConfigError, match="expected alternate, linspace, forward:N:M or all"):
         split_frames(range(28), spec)
 
 
