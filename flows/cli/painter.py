@@ -26,9 +26,8 @@ app = typer.Typer(help="Train painters, judge them, say what they are.", no_args
 WORDS = """
 seeds: Synthetic streets by their seeds: a range 1000:1004, the last excluded, or a list 1000,1007.
 scenes: A stored scene as dataset/sequence. May be repeated.
-split: Which frames of recorded scenes are fitted, the others giving true images: alternate (every
-  second one), linspace (half of them at even steps, the last one too), forward:17:8 (every second
-  of the first 17, and the last 8 are not), or all.
+split: Which frames of recorded scenes are fitted, the others giving true images: alternate,
+  linspace, forward:17:8 or all, as `reconstruct --help` explains them.
 cameras: Names of the cameras of recorded scenes, with commas between; all if absent.
 settings: Changes one setting, such as training.steps=500; `lidarpainter settings --of train` lists
   them all. May be repeated.
