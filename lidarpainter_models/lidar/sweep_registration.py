@@ -110,7 +110,8 @@ def _swept(scene: DrivingScene, frame_index: int, boxes: MovingBoxes) -> _Swept:
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz_m.double().numpy()))
     cloud = cloud.voxel_down_sample(CELL_M)
     around = open3d.geometry.KDTreeSearchParamHybrid(radius=PATCH_REACH_M, max_nn=PATCH_POINTS)
-    cloud.estimate_covariances(around)
+    if not cloud.is_empty():  # of which open3d would complain on the terminal
+        cloud.estimate_covariances(around)
     points_m = np.asarray(cloud.points).reshape(-1, 3)
     variances, axes = np.linalg.eigh(np.asarray(cloud.covariances).reshape(-1, 3, 3))
     thickness, width, length = np.sqrt(np.maximum(variances, 0.0)).T

@@ -85,6 +85,19 @@ def test_corrections_are_linear_between_their_times_and_end_with_them():
     assert EgoCorrections.none().at(3).equal(torch.eye(4).double())
 
 
+def test_a_sweep_that_met_nothing_stays_as_recorded_and_harms_no_other(street, monkeypatch, capfd):
+    scene, planted = recorded_wrongly(street, turn_rad=2e-3)
+    read, empty = scene.read_positions, scene.swept_frames[4]
+    monkeypatch.setattr(
+        scene, "read_positions", lambda frame: read(frame)[: 0 if frame == empty else None]
+    )
+    found = register_sweeps(scene).tangent
+    assert not bool(found[4].any())
+    others = [row for row in range(STREET.num_frames) if row != 4]
+    assert float((found + planted)[others, :2].std()) < 0.4 * float(planted[:, :2].std())
+    assert capfd.readouterr().out == ""
+
+
 def test_one_swept_frame_tells_nothing(street):
     one = DrivingScene.open(street.path)
     one.sweeps = one.sweeps_of(one.swept_frames[0])
