@@ -1,6 +1,7 @@
 """A log without LiDAR gets its points from training images."""
 
 import pytest
+import torch
 from toy_street import CAR_SIZE_M, ToyStreet
 from wall_drive import WALL_X_M, WallDrive
 
@@ -63,14 +64,13 @@ def test_images_from_one_place_are_one_clear_error():
 
 def test_a_frame_that_no_lidar_swept_takes_its_sky_from_the_nearest():
     street = ToyStreet()
-    swept = prepare_observations(
-        street, split_views(street, "all"), ObservationConfig(width_px=240)
-    )
+    # poses are exact, and sweeps that differ would move them by what float32 leaves
+    config = ObservationConfig(width_px=240, registers_sweeps=False)
+    swept = prepare_observations(street, split_views(street, "all"), config)
     street.sweeps = tuple(sweep for sweep in street.sweeps if sweep.frame_index != 2)
-    gap = prepare_observations(street, split_views(street, "all"), ObservationConfig(width_px=240))
+    gap = prepare_observations(street, split_views(street, "all"), config)
     assert not bool(gap.views[2].lidar_depth_m.any())
     differs = gap.views[2].sky_mask != swept.views[2].sky_mask
     assert float(differs.float().mean()) < 0.02
     assert bool(swept.views[2].sky_mask.any())
-    moved = (gap.views[1].lidar_depth_m - swept.views[1].lidar_depth_m).abs() > 1e-3
-    assert float(moved.float().mean()) < 0.002  # points on the edge of a pixel
+    assert torch.equal(gap.views[1].lidar_depth_m, swept.views[1].lidar_depth_m)
