@@ -105,7 +105,8 @@ class CameraCorrections:
         """The camera of a recorded view at its refined pose.
 
         A training view has a pose of its own; at any other time it is blended from those of the
-        same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
+        same camera (see `pose_blending`). A camera never trained on stands where its recording
+        and the sweeps say.
         """
         row, camera_name = self.row_of(key), key[1]
         camera = self.path.of_camera(camera, timestamp_ns)

@@ -5,8 +5,8 @@ Gaussian is drawn at the moment its centre's pixel is read: its centre is moved 
 it then has before the camera (as Seiskari et al. 2024 do), and each of its axes grows by as much as
 its ends are moved apart, being read one after the other: else the near road tears. Directions of
 axes, colours, the sky and the order of drawing stay those of the middle of the image. The
-rasteriser knows nothing of it. Gradients reach centres and sizes as if all were read at once: what
-moves a centre by a centimetre changes when it is read by too little to matter.
+rasteriser knows nothing of it. Gradients reach centres and sizes as if all were read at once: one
+step of a fit moves a centre too little to change when it is read.
 """
 
 from dataclasses import replace
