@@ -11,6 +11,7 @@ from flows.cli.shared_options import (
     AsJson,
     Painter,
     Settings,
+    check_painter,
     described,
     parse_bytes,
     parse_names,
@@ -108,6 +109,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         with_changes(parameters, changes), [*asked.get("set", []), *(settings or [])]
     )
     parameters = with_changes(parameters, of_fits(parameters, seed, memory, time_limit))
+    check_painter(parameters.painter)
     say_status(f"opening {scene}")
     store = existing_store()
     result = run_reconstruction(parameters, store)

@@ -4,11 +4,13 @@ Their confidence says where something measured stands behind the colour, not how
 is: it is meant for weighting guidance.
 """
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.painter.protocol import Painting, PaintingConditions
+from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 
 DISAGREEMENT_SCALE = 0.1
 """Mean absolute rgb difference at which two images no longer support each other (1/e)."""
@@ -65,3 +67,10 @@ class WarpPainter:
 
 def _support(difference: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     return torch.exp(-difference / DISAGREEMENT_SCALE)
+
+
+RULES: dict[str, Callable[[], Painter]] = {
+    UnpaintedPainter.name: UnpaintedPainter,
+    OverlayPainter.name: OverlayPainter,
+    WarpPainter.name: WarpPainter,
+}

@@ -3,6 +3,7 @@
 The table needs no tensors, so that a command's help can show it; `selection.py` loads painters.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,10 @@ BUNDLED_NANO = Path(__file__).parent / "bundled" / "nano.safetensors"
 NO_PAINTER = "none"
 WEIGHTS_SUFFIX = ".safetensors"
 DIGEST_LENGTH = 32
+SD_TURBO = "sd-turbo"
+WIRINGS = ("paper", "as-shipped", "fast", "with-reference")
+"""Presets of the one-step painter, in `one_step/config.py`; one stands after a model's colon."""
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 PainterKind = Literal["rule", "nano", "one-step"]
 
@@ -42,10 +47,27 @@ PAINTERS = (
         kind="nano",
     ),
     KnownPainter(
-        name="sd-turbo",
+        name=SD_TURBO,
         meaning="the one-step painter network; also its .safetensors file or a model's folder",
         kind="one-step",
     ),
 )
 """A rule is a row here and a class in `baselines.py`; how a network loads, `PainterChoice` says."""
 PAINTER_NAMES = tuple(row.name for row in PAINTERS)
+
+
+def is_model_name(name: str) -> bool:
+    """Whether a name may stand for a model: `sd-turbo`, a folder, an id of the hub."""
+    model, _ = split_preset(name)
+    return model == SD_TURBO or Path(model).is_dir() or is_hub_id(model)
+
+
+def is_hub_id(name: str) -> bool:
+    """Whether a name reads `owner/model`."""
+    return _HUB_ID.fullmatch(name) is not None
+
+
+def split_preset(name: str) -> tuple[str, str]:
+    """A model and the preset after its last colon, `paper` without one."""
+    model, _, preset = name.rpartition(":")
+    return (model, preset) if model and preset in WIRINGS else (name, "paper")

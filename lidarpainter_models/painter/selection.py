@@ -4,15 +4,12 @@ What names there are, `known_painters.py` says.
 """
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.known_painters import (
     BUNDLED_NANO,
     DIGEST_LENGTH,
@@ -20,15 +17,16 @@ from lidarpainter_models.painter.known_painters import (
     PAINTERS,
     WEIGHTS_SUFFIX,
     PainterKind,
+    is_model_name,
+    split_preset,
 )
-from lidarpainter_models.painter.protocol import Painter
 
-RULES: dict[str, Callable[[], Painter]] = {
-    UnpaintedPainter.name: UnpaintedPainter,
-    OverlayPainter.name: OverlayPainter,
-    WarpPainter.name: WarpPainter,
-}
-_loaded: dict[tuple[str, str, torch.dtype | None], Painter] = {}
+if TYPE_CHECKING:  # a name is read without them: a command refuses a mistyped one at once
+    import torch
+
+    from lidarpainter_models.painter.protocol import Painter
+
+_loaded: "dict[tuple[str, str, torch.dtype | None], Painter]" = {}
 """The painter that was loaded last, by its digest, device and precision."""
 
 
@@ -52,10 +50,9 @@ class PainterChoice:
         for row in PAINTERS:
             if row.name == name:
                 return cls(name=name, kind=row.kind)
-        from lidarpainter_models.painter.one_step.loading import is_model_name
-        from lidarpainter_models.painter.one_step.weights import is_trained_file
-
         if name.endswith(WEIGHTS_SUFFIX):
+            from lidarpainter_models.painter.one_step.weights import is_trained_file
+
             return cls(name=name, kind="one-step" if is_trained_file(Path(name)) else "nano")
         if is_model_name(name):
             return cls(name=name, kind="one-step")
@@ -93,12 +90,10 @@ class PainterChoice:
         digests = [file_digest(path) for path in self.files]
         if self.kind == "nano":
             return digests[0][:DIGEST_LENGTH]
-        from lidarpainter_models.painter.one_step.loading import split_preset
-
         joined = "\n".join([split_preset(self.name)[1], *digests])
         return hashlib.sha256(joined.encode()).hexdigest()[:DIGEST_LENGTH]
 
-    def load(self, device: torch.device, precision: torch.dtype | None = None) -> Painter:
+    def load(self, device: "torch.device", precision: "torch.dtype | None" = None) -> "Painter":
         """The painter on a device; whoever asks for the same one again gets the one in memory.
 
         The default precision is the one that the device computes faster.
@@ -113,8 +108,10 @@ class PainterChoice:
             _loaded[key] = self._new(device, precision)
         return _loaded[key]
 
-    def _new(self, device: torch.device, precision: torch.dtype | None) -> Painter:
+    def _new(self, device: "torch.device", precision: "torch.dtype | None") -> "Painter":
         if self.kind == "rule":
+            from lidarpainter_models.painter.baselines import RULES
+
             return RULES[self.name]()
         if self.kind == "nano":
             from lidarpainter_models.painter.nano.weights import load_weights
@@ -125,7 +122,7 @@ class PainterChoice:
         return load_one_step(self.name, device=device, dtype=precision)
 
 
-def load_painter(name_or_path: str | Path, device: torch.device | None = None) -> Painter:
+def load_painter(name_or_path: str | Path, device: "torch.device | None" = None) -> "Painter":
     """The painter of a name; a one-step painter goes to the GPU if there is one and none is said.
 
     Raises:
@@ -134,6 +131,8 @@ def load_painter(name_or_path: str | Path, device: torch.device | None = None) -
     """
     choice = PainterChoice.of(name_or_path)
     if device is None:
+        import torch
+
         has_gpu = choice.kind == "one-step" and torch.cuda.is_available()
         device = torch.device("cuda" if has_gpu else "cpu")
     return choice.load(device)

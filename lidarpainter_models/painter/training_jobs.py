@@ -6,12 +6,11 @@ import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX, split_preset
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoJob, NanoTrainingConfig
 from lidarpainter_models.painter.one_step.config import PRESETS
 from lidarpainter_models.painter.one_step.job import CPU, NO_FILES, OneStepJob
-from lidarpainter_models.painter.one_step.loading import split_preset
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
 from lidarpainter_models.painter.selection import PainterChoice

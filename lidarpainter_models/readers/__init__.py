@@ -5,32 +5,55 @@ Here is which datasets there are, what they hold, and how one is ingested.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.canonical.reader import (
-    ForeignScene,
-    list_canonical_scenes,
-    own_scene_id,
-)
-from lidarpainter_models.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
-from lidarpainter_models.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
-from lidarpainter_models.readers.source_logs.log import Progress, SourceLog, write_log
-from lidarpainter_models.readers.waymo.reader import WaymoLog, list_waymo_segments
-from lidarpainter_models.scenes.validation import require_name
 
-ListSequences = Callable[[Path], tuple[str, ...]]
-"""The sequences below a root, by name."""
-OpenLog = Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]
-"""Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
+if TYPE_CHECKING:  # which datasets there are is known without them: a mistyped one costs nothing
+    from lidarpainter_models.readers.source_logs.log import Progress, SourceLog
 
 CANONICAL = "canonical"
 """In place of a dataset: scenes that were written elsewhere, whatever dataset they are of."""
 
-_READERS: dict[str, tuple[ListSequences, OpenLog]] = {
-    "pandaset": (list_pandaset_sequences, PandasetLog),
-    "nuscenes": (list_nuscenes_scenes, NuscenesLog),
-    "waymo": (list_waymo_segments, WaymoLog),
-    CANONICAL: (list_canonical_scenes, ForeignScene),
+
+class Reader(NamedTuple):
+    """The functions of a dataset's reader."""
+
+    list_sequences: Callable[[Path], tuple[str, ...]]
+    """The sequences below a root, by name."""
+    open_log: "Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]"
+    """Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
+
+
+def _pandaset() -> Reader:
+    from lidarpainter_models.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
+
+    return Reader(list_pandaset_sequences, PandasetLog)
+
+
+def _nuscenes() -> Reader:
+    from lidarpainter_models.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
+
+    return Reader(list_nuscenes_scenes, NuscenesLog)
+
+
+def _waymo() -> Reader:
+    from lidarpainter_models.readers.waymo.reader import WaymoLog, list_waymo_segments
+
+    return Reader(list_waymo_segments, WaymoLog)
+
+
+def _canonical() -> Reader:
+    from lidarpainter_models.readers.canonical.reader import ForeignScene, list_canonical_scenes
+
+    return Reader(list_canonical_scenes, ForeignScene)
+
+
+_READERS: dict[str, Callable[[], Reader]] = {
+    "pandaset": _pandaset,
+    "nuscenes": _nuscenes,
+    "waymo": _waymo,
+    CANONICAL: _canonical,
 }
 
 
@@ -45,10 +68,10 @@ def list_sequences(dataset: str, root: Path) -> tuple[str, ...]:
     Raises:
         DataError: the dataset is not known, or the root is no folder or holds no sequence.
     """
-    list_found, _open_log = _reader(dataset)
+    reader = _reader(dataset)
     if not Path(root).is_dir():
         raise DataError(f"{root}: no such folder, expected the root of {dataset}")
-    found = list_found(Path(root))
+    found = reader.list_sequences(Path(root))
     if not found:
         raise DataError(f"{root}: no {dataset} sequence found")
     return found
@@ -60,7 +83,11 @@ def scene_id_of(dataset: str, root: Path, sequence: str) -> str:
     Raises:
         DataError: it is a scene from elsewhere whose manifest says no names.
     """
-    return own_scene_id(root, sequence) if dataset == CANONICAL else f"{dataset}/{sequence}"
+    if dataset != CANONICAL:
+        return f"{dataset}/{sequence}"
+    from lidarpainter_models.readers.canonical.reader import own_scene_id
+
+    return own_scene_id(root, sequence)
 
 
 def ingest_scene(
@@ -71,7 +98,7 @@ def ingest_scene(
     *,
     frames: slice | None = None,
     cameras: tuple[str, ...] | None = None,
-    progress: Progress | None = None,
+    progress: "Progress | None" = None,
 ) -> Path:
     """Read one sequence of a dataset and write it into the store; gives the scene's path.
 
@@ -79,6 +106,8 @@ def ingest_scene(
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.
         WriteError: the store cannot be written.
     """
+    from lidarpainter_models.readers.source_logs.log import write_log
+
     log = open_log(dataset, root, sequence, frames=frames, cameras=cameras)
     return write_log(log, Path(store), progress=progress)
 
@@ -90,7 +119,7 @@ def open_log(
     *,
     frames: slice | None = None,
     cameras: tuple[str, ...] | None = None,
-) -> SourceLog:
+) -> "SourceLog":
     """Open one sequence of a dataset.
 
     The root is the folder as downloaded. Frames are taken by position, cameras by name; None takes
@@ -99,15 +128,14 @@ def open_log(
     Raises:
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.
     """
-    _list_found, open_found = _reader(dataset)
+    from lidarpainter_models.scenes.validation import require_name
+
+    reader = _reader(dataset)
     require_name(sequence, "sequence")
-    return open_found(Path(root), sequence, frames, cameras)
+    return reader.open_log(Path(root), sequence, frames, cameras)
 
 
-def _reader(dataset: str) -> tuple[ListSequences, OpenLog]:
-    try:
-        return _READERS[dataset]
-    except KeyError:
-        raise DataError(
-            f"dataset {dataset!r} is not known, expected one of {', '.join(_READERS)}"
-        ) from None
+def _reader(dataset: str) -> Reader:
+    if dataset not in _READERS:
+        raise DataError(f"dataset {dataset!r} is not known, expected one of {', '.join(_READERS)}")
+    return _READERS[dataset]()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.painter.known_painters import SD_TURBO, is_hub_id
 from lidarpainter_models.painter.one_step.architectures import (
     Architecture,
     build_tiny,
@@ -25,7 +26,6 @@ from lidarpainter_models.painter.one_step.config import AutoencoderKind, OneStep
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
 from lidarpainter_models.painter.tensor_files import fill_from_file
 
-SD_TURBO = "sd-turbo"
 SD_TURBO_HUB = "stabilityai/sd-turbo"
 TAESD_HUB = "madebyollin/taesd"
 TAESD_FOLDER = "taesd"
@@ -36,7 +36,6 @@ KNOWN_LICENCES = {
 }
 UNKNOWN_LICENCE = "unknown"
 WEIGHT_NAMES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.fp16.safetensors")
-_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _OLD_ATTENTION = {
     ".query.": ".to_q.",
     ".key.": ".to_k.",
@@ -113,11 +112,6 @@ def find_folder(name: str, *, may_download: bool = False) -> Path:
             "of a copy, or fetch it once with the hub's own client"
         ) from None
     return Path(found)
-
-
-def is_hub_id(name: str) -> bool:
-    """Whether a name reads `owner/model`."""
-    return _HUB_ID.fullmatch(name) is not None
 
 
 def load_parts(base: BaseModel, config: OneStepConfig, *, dtype: torch.dtype) -> BaseParts:

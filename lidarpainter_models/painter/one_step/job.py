@@ -14,9 +14,9 @@ from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
-from lidarpainter_models.painter.known_painters import DIGEST_LENGTH, WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import DIGEST_LENGTH, WEIGHTS_SUFFIX, split_preset
 from lidarpainter_models.painter.one_step.base_models import open_base
-from lidarpainter_models.painter.one_step.loading import load_trainable, split_preset
+from lidarpainter_models.painter.one_step.loading import load_trainable
 from lidarpainter_models.painter.one_step.processes import run_in_processes
 from lidarpainter_models.painter.one_step.training import (
     Judges,

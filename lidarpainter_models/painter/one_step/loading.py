@@ -13,14 +13,12 @@ from pathlib import Path
 import torch
 
 from lidarpainter_models.errors import ConfigError, WeightsError
-from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX, split_preset
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import assemble, made_lean, trained_in_float32
 from lidarpainter_models.painter.one_step.base_models import (
-    SD_TURBO,
     BaseModel,
     BaseParts,
-    is_hub_id,
     load_parts,
     model_files,
     open_base,
@@ -123,12 +121,6 @@ def load_trainable(
     )
 
 
-def is_model_name(name: str) -> bool:
-    """Whether a name may stand for a model: `sd-turbo`, a folder, an id of the hub."""
-    model, _ = split_preset(name)
-    return model == SD_TURBO or Path(model).is_dir() or is_hub_id(model)
-
-
 def painter_files(name: str) -> list[Path]:
     """The files that a painter of this name is made of, in a fixed order.
 
@@ -139,12 +131,6 @@ def painter_files(name: str) -> list[Path]:
         return [file.path, *model_files(_base_of(file), file.config.autoencoder)]
     model, preset = split_preset(name)
     return model_files(open_base(model), PRESETS[preset].autoencoder)
-
-
-def split_preset(name: str) -> tuple[str, str]:
-    """A model and the preset after its last colon, `paper` without one."""
-    model, _, preset = name.rpartition(":")
-    return (model, preset) if model and preset in PRESETS else (name, "paper")
 
 
 def _file_of(name: str) -> TrainedFile | None:
