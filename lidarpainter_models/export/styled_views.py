@@ -82,10 +82,10 @@ def write_styled(
     for number, moment in enumerate(path.views):
         camera = path.camera(number)
         view, lidar_depth_m = _view(path, camera, moment, request.images)
-        # every frame has its own drops and noise, and the same ones each time
+        # every frame has its own drops and noise, and the same ones each time; puddles stay
         generator = torch.Generator().manual_seed((request.seed << 32) + moment.frame_index)
         passed = (moment.timestamp_ns - first_ns) / span_ns
-        styled = apply_mix(view, request.mix, generator, progress=passed)
+        styled = apply_mix(view, request.mix, generator, progress=passed, place_seed=request.seed)
         file = write_png(styled, out / f"{moment.frame_index:04d}.png")
         write_png(view.rgb, out / CLEAR_FOLDER / file.name)
         agreement = edge_agreement(styled, view.rgb, lidar_depth_m)

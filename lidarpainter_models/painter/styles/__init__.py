@@ -21,8 +21,11 @@ def apply_style(
     *,
     strength: float = 1.0,
     visibility_m: float = FOG_VISIBILITY_M,
+    place_seed: int = 0,
 ) -> Float[Tensor, "height width 3"]:
     """The view in a style, as displayed; the same for the same state of the generator.
+
+    `place_seed` decides what stays where it is from view to view: puddles.
 
     Raises:
         ConfigError: there is no such style.
@@ -33,16 +36,17 @@ def apply_style(
     if prompt == "night":
         return turn_to_night(view, generator, strength)
     if prompt == "rain":
-        return add_rain(view, generator, strength)
+        return add_rain(view, generator, strength, place_seed=place_seed)
     return view.rgb
 
 
 def apply_mix(
-    view: StyleView, mix: StyleMix, generator: Generator, *, progress: float
+    view: StyleView, mix: StyleMix, generator: Generator, *, progress: float, place_seed: int = 0
 ) -> Float[Tensor, "height width 3"]:
     """The view under all styles of a mix: first it gets wet, then dark, then fog comes up.
 
     `progress` is the share of the log's time that has passed, which strengths may follow.
+    `place_seed` is that of `apply_style`.
     """
     strengths = mix.strengths(progress)
     for prompt in ("rain", "night", "foggy"):
@@ -53,6 +57,7 @@ def apply_mix(
                 generator,
                 strength=strengths[prompt],
                 visibility_m=mix.visibility_m,
+                place_seed=place_seed,
             )
             view = replace(view, rgb=rgb)
     return view.rgb

@@ -57,14 +57,15 @@ _LINE_BITS = 3  # of a pixel's fraction in drawn lines
 
 
 def add_rain(
-    view: StyleView, generator: Generator, strength: float = 1.0
+    view: StyleView, generator: Generator, strength: float = 1.0, *, place_seed: int = 0
 ) -> Float[Tensor, "height width 3"]:
-    """The view in steady rain by day, as displayed; the generator draws puddles and drops.
+    """The view in steady rain by day, as displayed; the generator draws drops, the seed puddles.
 
-    Between the strengths 0, which is dry, and 1, the light of both is mixed.
+    Views of one place and one seed show the same puddles. Between the strengths 0, which is dry,
+    and 1, the light of both is mixed.
     """
     dry = to_linear(view.rgb)
-    rain = _streaked(_wet(view, dry, generator), view, generator)
+    rain = _streaked(_wet(view, dry, Generator().manual_seed(place_seed)), view, generator)
     return to_display(dry + strength * (rain - dry))
 
 
@@ -74,7 +75,7 @@ def fall_speed_mps(diameter_mm: Float[Tensor, " drops"]) -> Float[Tensor, " drop
 
 
 def _wet(
-    view: StyleView, dry: Float[Tensor, "height width 3"], generator: Generator
+    view: StyleView, dry: Float[Tensor, "height width 3"], place: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Everything but the streaks."""
     tint = torch.tensor(OVERCAST_TINT)
@@ -83,7 +84,7 @@ def _wet(
     walls = wet_reflectance(dull, 0.5 * WETNESS)
     light = walls + open_sky(view)[..., None] * (CLOUD_LIGHT * tint - walls)
     distance_m = distances(view)
-    light = _with_wet_road(light, dull, view, distance_m, generator)
+    light = _with_wet_road(light, dull, view, distance_m, place)
     through = torch.exp(-rain_extinction_per_m(RAIN_MM_PER_H) * distance_m)
     through = torch.where(view.surface, through, 1.0)[..., None]
     return light * through + CLOUD_LIGHT * tint * (1 - through)
@@ -94,7 +95,7 @@ def _with_wet_road(
     dull: Float[Tensor, "height width 3"],
     view: StyleView,
     distance_m: Float[Tensor, "height width"],
-    generator: Generator,
+    place: Generator,
 ) -> Float[Tensor, "height width 3"]:
     """Darker ground that mirrors what stands on it; the view as it is where no ground is seen."""
     camera = view.camera
@@ -106,7 +107,8 @@ def _with_wet_road(
     points_m = ground.flattened(points_m)
     cloud = CLOUD_LIGHT * torch.tensor(OVERCAST_TINT)
     mirror = mirrored(light, cloud, camera, points_m, share > 0.01)
-    still = puddles(points_m, generator, share=PUDDLE_SHARE)
+    centre_m = camera.world_from_camera[:3, 3].float()
+    still = puddles(points_m + centre_m, place, share=PUDDLE_SHARE)
     shine = fresnel(-ray_directions(camera)[..., 2])
     shine = shine * (FILM_SHINE + (1 - FILM_SHINE) * still) * WETNESS
     road = wet_reflectance(dull, WETNESS)

@@ -1,5 +1,7 @@
 """Rain: dark wet surfaces, a road that mirrors, drops that fall as drops do."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -87,3 +89,21 @@ def test_rain_hides_what_is_far_and_darkens_what_is_near(street, monkeypatch):
         gap = (luminance(light)[place].mean() - cloud).abs()
         left = (luminance(veiled)[place].mean() - cloud).abs()
         assert float(left) < (1 - least) * float(gap) + 0.01
+
+
+def test_puddles_stay_where_they_are_from_view_to_view(street, monkeypatch):
+    monkeypatch.setattr(rain, "fresnel", lambda cosine: torch.ones_like(cosine))
+    monkeypatch.setattr(rain, "FILM_SHINE", 0.0)
+    monkeypatch.setattr(rain, "STREAK_CONTRAST", 0.0)
+    camera = street.camera
+    pose = camera.world_from_camera.clone()
+    pose[1, 3] -= 2.0
+    aside = replace(street, camera=replace(camera, world_from_camera=pose))
+    first, moved = (add_rain(view, generator_of()) for view in (street, aside))
+    again = add_rain(street, generator_of(1))
+    other = add_rain(street, generator_of(), place_seed=1)
+    road = slice(70, 88), slice(60, 100)
+    torch.testing.assert_close(again[road], first[road])
+    assert float((other - first)[road].abs().mean()) > 0.02
+    # the same picture from 2 m to the right shows other ground: its puddles are others
+    assert float((moved - first)[road].abs().mean()) > 0.02
