@@ -109,6 +109,7 @@ def _record_image(
             camera_name=rig.name,
             timestamp_ns=timestamp_ns,
             camera=stated.at(stated.world_from_camera @ error),
+            distortion=street.distortion(rig.name),
             rolling_shutter=RollingShutter(duration_s=rig.readout_s, direction="down")
             if rig.readout_s and config.is_readout_told
             else None,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.scenes.records import SweepPoints
+from lidarpainter_models.scenes.records import Distortion, SweepPoints
 from lidarpainter_models.synthetic.config import RigCamera, SyntheticStreetConfig
 from lidarpainter_models.synthetic.lidar_sensor import (
     beam_inclinations_rad,
@@ -112,6 +112,13 @@ class SyntheticStreet:
         pose = self.world_from_ego(timestamp_ns) @ ego_from_camera(rig)
         focal_px = rig.focal_per_width * width_px
         return Camera.centred(pose, focal_px, width_px=width_px, height_px=height_px)
+
+    def distortion(self, name: str) -> Distortion:  # noqa: ARG002
+        """How the lens of a camera of the rig departs from `camera`: not at all.
+
+        A street of other lenses overrides it, and `camera` and `render_recorded` with it.
+        """
+        return Distortion()
 
     def actors(self, timestamp_ns: int) -> list[ActorState]:
         """Every actor's box at a time, in the order of `actor_index`."""
