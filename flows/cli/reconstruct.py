@@ -111,8 +111,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     parameters = with_changes(parameters, of_fits(parameters, seed, memory, time_limit))
     check_painter(parameters.painter)
     say_status(f"opening {scene}")
-    store = existing_store()
-    result = run_reconstruction(parameters, store)
+    result = run_reconstruction(parameters, store := existing_store())
     if tensorboard is not None:
         write_events(store, result, tensorboard)
     (print_json if as_json else show)(result)
