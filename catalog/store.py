@@ -288,9 +288,8 @@ def open_store(path: Path | str | None = None) -> Store:
         return Store(mirror.root, mirror)
     root = expanded(text)
     if found := _UNSTORABLE.search(str(root)):
-        raise CatalogError(
-            f"{str(root)!r}, the store: Delta tables cannot have {found[0]!r} in a path"
-        )
+        told = f"Delta tables cannot have {found[0]!r} in a path, choose a folder without it"
+        raise CatalogError(f"{str(root)!r}, the store: {told}")
     try:
         if root.is_dir() or not root.exists():
             return Store(root)

@@ -23,6 +23,10 @@ CELL_RAD, LARGEST_CELL_RAD = math.radians(1.0), math.radians(4.0)
 are doubled up to the larger size until as many returns lie around most as `FEW_AROUND`: a LiDAR of
 few beams is judged by its own spacing, and a turn that is sparser still tells nothing."""
 FEW_AROUND = 12
+LEAST_AROUND = 7
+"""Among fewer in the directions around a return below the LiDAR tells nothing: the road was sampled
+sparsely there, as in clouds that were thinned to one spacing in metres. Above, where most beams
+meet nothing, drops have nothing around."""
 CELL_RANGE = 0.03
 """As a share of the range."""
 LEAST_SHARE = 0.03
@@ -67,6 +71,7 @@ def stands_alone(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]
     while cell_rad <= LARGEST_CELL_RAD:
         is_alone, around = _alone_among_cells(offset_m, range_m, cell_rad)
         is_alone &= range_m <= WEATHER_REACH_M
+        is_alone &= (around >= LEAST_AROUND) | (offset_m[:, 2] >= 0)
         is_sparse = is_alone.sum() > MOST_ALONE * (range_m <= WEATHER_REACH_M).sum()
         if is_sparse or around.median() >= FEW_AROUND:
             return is_alone

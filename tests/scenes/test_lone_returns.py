@@ -83,3 +83,12 @@ def test_as_few_lone_returns_as_in_clear_air_stay(share, kept_share):
 def test_a_lidar_of_wide_spacing_is_judged_by_its_own(beams, columns):
     directions, range_m = turn_of(beams, columns)
     assert stands_alone(directions * range_m[:, None]).float().mean() < 0.005
+
+
+def test_a_road_thinned_to_one_spacing_in_metres_has_no_drops():
+    x_m, y_m = torch.meshgrid(torch.arange(-10, 60, 0.5), torch.arange(-12, 12, 0.5), indexing="ij")
+    road = torch.stack([x_m, y_m, torch.full_like(x_m, -HEIGHT_M)], dim=-1).reshape(-1, 3)
+    assert is_confirmed(road + 0.1).all()
+    drops = 20.0 * torch.rand(150, 3, generator=torch.Generator().manual_seed(0)) - 10.0
+    drops[:, 2] = drops[:, 2].abs() + 0.5
+    assert is_confirmed(torch.cat([road, drops]))[-150:].float().mean() < 0.1
