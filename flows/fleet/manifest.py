@@ -212,7 +212,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """The values of a TOML file from outside.
 
     Raises:
-        ConfigError: it cannot be read, is too large, or is no TOML.
+        ConfigError: it cannot be read, is too large, or is no TOML in UTF-8.
     """
     try:
         content = path.read_bytes()
@@ -222,7 +222,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: expected a manifest of at most {MAX_BYTES} bytes")
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or too deep
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: expected TOML in UTF-8: save it in that encoding") from None
+    except (ValueError, RecursionError) as error:  # of TOML, or too deep
         raise ConfigError(f"{path}: expected TOML: {error}") from None
 
 

@@ -177,15 +177,24 @@ def check_timestamps(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether time runs forward, without gaps."""
     steps_s = scene.frame_timestamps_ns.diff().double() / 1e9
     for name in scene.camera_names:
-        times_ns = [view.timestamp_ns for view in scene.views_of(name)]
-        if any(later <= earlier for earlier, later in pairwise(times_ns)):
-            return "fail", f"the times of {name} do not ascend"
+        for before, view in pairwise(scene.views_of(name)):
+            if view.timestamp_ns <= before.timestamp_ns:
+                early_ms = (before.timestamp_ns - view.timestamp_ns) / 1e6
+                return "fail", (
+                    f"the times of {name} do not ascend: frame {view.frame_index} has an image "
+                    f"{early_ms:.0f} ms older than frame {before.frame_index}'s: give each its own "
+                    "time, and leave an image out that was there before"
+                )
     if len(steps_s) == 0:
         return "warn", "a single frame"
     middle_s = float(steps_s.median())
     gaps = int((steps_s > 1.5 * middle_s).sum())
     detail = f"{len(scene.frame_indices)} frames, every {1000 * middle_s:.0f} ms"
-    return ("warn", f"{detail}, {gaps} gaps") if gaps else ("ok", detail)
+    if gaps:
+        longest = int(steps_s.argmax())
+        after = f"{steps_s[longest]:.1f} s before frame {_frame_after(scene, longest)}"
+        return "warn", f"{detail}, {gaps} gaps, the longest of {after}"
+    return "ok", detail
 
 
 def check_camera_sync(scene: DrivingScene) -> tuple[Verdict, str]:

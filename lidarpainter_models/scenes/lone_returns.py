@@ -71,10 +71,11 @@ def stands_alone(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]
     while cell_rad <= LARGEST_CELL_RAD:
         is_alone, around = _alone_among_cells(offset_m, range_m, cell_rad)
         is_alone &= range_m <= WEATHER_REACH_M
-        is_alone &= (around >= LEAST_AROUND) | (offset_m[:, 2] >= 0)
         is_sparse = is_alone.sum() > MOST_ALONE * (range_m <= WEATHER_REACH_M).sum()
-        if is_sparse or around.median() >= FEW_AROUND:
+        if is_sparse:
             return is_alone
+        if around.median() >= FEW_AROUND:
+            return is_alone & ((around >= LEAST_AROUND) | (offset_m[:, 2] >= 0))
         cell_rad *= 2
     return torch.zeros_like(is_alone)
 

@@ -158,7 +158,20 @@ def test_camera_clock_off_by_half_a_second_is_found(scene):
 def test_camera_times_that_run_backwards_are_found(scene):
     times_ns = [view.timestamp_ns for view in scene.views_of("left_camera")][::-1]
     change_views(scene, "left_camera", lambda view, row: replace(view, timestamp_ns=times_ns[row]))
-    assert check_timestamps(scene)[0] == "fail"
+    first, second = scene.views_of("left_camera")[:2]
+    verdict, told = check_timestamps(scene)
+    assert verdict == "fail"
+    assert (
+        f"frame {second.frame_index} has an image 100 ms older than frame {first.frame_index}'s"
+        in told
+    )
+
+
+def test_a_pause_of_the_recorder_is_told_with_its_place(scene):
+    scene.frame_timestamps_ns[2:] += 2_000_000_000
+    verdict, told = check_timestamps(scene)
+    assert verdict == "warn"
+    assert f"1 gaps, the longest of 2.1 s before frame {scene.frame_indices[2]}" in told
 
 
 def test_camera_that_leaves_its_mount_is_found(pandaset, tmp_path):

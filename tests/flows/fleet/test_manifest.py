@@ -89,6 +89,14 @@ def test_a_manifest_saved_by_a_windows_editor_is_read(tmp_path):
     assert read_manifest(file).name == "night"
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_a_manifest_in_another_encoding_says_what_to_do(tmp_path, encoding):
+    file = tmp_path / "night.toml"
+    file.write_bytes(f"{GOOD}# n\xe4chtens\n".encode(encoding))
+    with pytest.raises(ConfigError, match=r"night\.toml: expected TOML in UTF-8: save it"):
+        read_manifest(file)
+
+
 def test_streets_are_drawn_as_the_source_says(asked_of):
     one, two = asked_of(f'{GOOD}frames = "0:6"\nwidth_px = 320\ncameras = ["front_camera"]\n')
     assert [one.scene_id, two.scene_id] == ["synthetic/street-0001", "synthetic/street-0002"]
