@@ -44,6 +44,8 @@ _PEAK_WIDTH_DEG, _ROLL_PEAK_WIDTH_DEG = 0.6, 0.8
 """Turns this near to the best one score well because of it."""
 _MIN_PX_PER_DEG = 2.2
 """In coarser images blurred edges of a street move the best turn by a degree."""
+_MIN_SIDE_PX = 64
+"""Fewer pixels across, as in a cut-out, show too few edges to tell any turn from the others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +114,9 @@ def why_untold(edges: SceneEdges, name: str) -> str | None:
     px_per_deg = min((image.camera.fx_px for image in images), default=0.0) * math.radians(1.0)
     if images and px_per_deg < _MIN_PX_PER_DEG:
         return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
+    side_px = min((min(one.camera.width_px, one.camera.height_px) for one in images), default=0)
+    if images and side_px < _MIN_SIDE_PX:
+        return f"images {side_px} pixels across, {_MIN_SIDE_PX} are needed"
     num_points = sum(len(points) for image in images for points, _ in image.points.values())
     if num_points < MIN_EDGE_POINTS or len(images) < MIN_IMAGES:
         return f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"

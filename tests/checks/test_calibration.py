@@ -8,7 +8,7 @@ import pytest
 import torch
 from drawn_streets import drawn_street
 
-from lidarpainter_models.checks.calibration import CameraTurn, check_calibration
+from lidarpainter_models.checks.calibration import CameraTurn, check_calibration, why_untold
 from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.doctor import check_licence
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
@@ -97,6 +97,13 @@ def test_small_images_cannot_tell(small_scene):
     verdict, detail = check_calibration(SceneEdges(small_scene))
     assert verdict == "ok"
     assert "front_camera cannot be told (images of 0.7 pixels a degree" in detail
+
+
+def test_narrow_cut_outs_cannot_tell(street):
+    edges = SceneEdges(DrivingScene.open(street))
+    for image in edges.images["front_camera"]:
+        object.__setattr__(image, "camera", replace(image.camera, width_px=60))
+    assert why_untold(edges, "front_camera") == "images 60 pixels across, 64 are needed"
 
 
 @pytest.mark.slow
