@@ -142,6 +142,13 @@ IMAGES: dict[str, Change] = {
     "upside-down": _with_images(lambda bgr, _frame: bgr[::-1, ::-1]),
 }
 """Odd images by name."""
+LOOKED_FOR_BY = {
+    "bonnet-dark": "own body",
+    "bonnet-bright": "own body",
+    "mirror": "own body",
+    "upside-down": "cameras in their place",
+}
+"""The check that looks for an odd image: a loss is named also where it says it could not look."""
 
 
 # --- lenses
