@@ -67,7 +67,7 @@ def keep_prefect_in(store: str) -> None:
     if os.environ.get(PREFECT_HOME, "") not in {"", *_chosen_homes}:
         return
     home = home_folder()
-    if home is not None and os.access(home, os.W_OK):
+    if home is not None and home.is_dir() and _can_write(home):
         os.environ.pop(PREFECT_HOME, None)
         return
     place = cache_folder() if store.startswith("s3:/") else expanded(store)

@@ -29,18 +29,21 @@ _OVER = {"turned upside down": (-1, -1), "mirrored": (1, -1), "flipped": (-1, 1)
 
 def check_image_places(edges: SceneEdges) -> tuple[Verdict, str]:
     """Whether the images of a camera are its own, and the right way up."""
-    told = {
-        name: images for name, images in edges.images.items() if why_untold(edges, name) is None
-    }
+    untold = {name: why for name in edges.images if (why := why_untold(edges, name)) is not None}
     over = [
         f"{name}'s look {way}"
-        for name, images in told.items()
+        for name, images in edges.images.items()
         for way, steps in _OVER.items()
-        if _lead(images, [_stepped(image, *steps) for image in images]) < -MIN_LEAD
+        if name not in untold
+        and _lead(images, [_stepped(image, *steps) for image in images]) < -MIN_LEAD
     ]
     if over:
         return "fail", f"depth edges fit other images better: {', '.join(over)}"
-    return _check_swapped(edges)
+    verdict, said = _check_swapped(edges)
+    untried = [
+        f"whether {name}'s are turned over was not checked ({untold[name]})" for name in untold
+    ]
+    return verdict, "; ".join([said, *untried])
 
 
 def _stepped(image: EdgeImage, rows: int, columns: int) -> EdgeImage:

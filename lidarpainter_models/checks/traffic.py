@@ -39,7 +39,7 @@ def check_traffic(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether moving things are boxed."""
     triples = _triples(scene)
     if not triples:
-        return "ok", "cannot be told: too few sweeps half a second apart"
+        return "ok", "not checked: too few sweeps half a second apart"
     counts = [_num_moved(scene, *triple) for triple in triples]
     mean = float(np.mean(counts))
     detail = f"{mean:.1f} things a sweep move without a box (within {_REACH_M:.0f} m)"
@@ -47,6 +47,11 @@ def check_traffic(scene: DrivingScene) -> tuple[Verdict, str]:
         return "warn", (
             f"{detail}: a fit holds what has no box for street, so they are smeared along their "
             "way and hide what is behind; add boxes with ids that last"
+        )
+    if not scene.tracks:
+        detail += (
+            "; nothing has a box, and what drives less than its own length in "
+            f"{_APART_S[0]:.1f} s was not checked"
         )
     return "ok", detail
 

@@ -10,6 +10,7 @@ while its brightness does not, and what stays is the place of the change alone. 
 shows no body, and nor does one as dark as the road.
 """
 
+import math
 from collections.abc import Sequence
 from operator import attrgetter
 
@@ -36,6 +37,8 @@ LEAST_MOTION_PX = 10.0
 """A place is judged where the ground would have moved so far from the first image to the last."""
 LOWER_PART, LEAST_LOOKED_AT = 4, 0.7
 """Bodies are at the bottom: images of whose lowest fourth less is judged were not searched."""
+LEAST_PX_PER_DEG = 2.2
+"""In coarser images, behind wide lenses, edges of bodies blur and are lost; what is found stays."""
 MOST_HEIGHT_M = 3.0
 """No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
 LEAST_EDGE = 1.5  # grey levels a pixel that stay
@@ -49,6 +52,7 @@ LINE_SHARE, FEW_LINE_SHARE, FEW_IMAGES = 0.04, 0.15, 8
 """Of the width: shorter pieces of an edge tell nothing; the second where images are few, for then
 patterns of the street meet by chance. Of few images only a body as wide as a bonnet is believed."""
 WIDE_SHARE = 0.5  # of the width: so long an edge need not reach the border, which may be dark
+GAP_SHARE = 0.25  # of the width: an edge across the image may be hidden so far
 STAYS_IN = 0.85
 """A sure edge is there in so many of the images."""
 STANDS_OUT = 2.4
@@ -89,11 +93,15 @@ def _too_little(views: Sequence[RecordedView]) -> str | None:
     apart = _far_apart(views)
     if len(apart) < LEAST_IMAGES:
         return f"{len(apart)} images taken apart, {LEAST_IMAGES} needed"
-    moved = _would_have_moved(_compared(apart))
-    if moved[-moved.shape[0] // LOWER_PART :].mean() >= LEAST_LOOKED_AT:
-        return None
-    width_px = moved.shape[1]
-    return f"in images {width_px} px wide the street near the car moved too little to tell"
+    cameras = _compared(apart)
+    moved = _would_have_moved(cameras)
+    if moved[-moved.shape[0] // LOWER_PART :].mean() < LEAST_LOOKED_AT:
+        width_px = moved.shape[1]
+        return f"in images {width_px} px wide the street near the car moved too little to tell"
+    px_per_deg = cameras[0].fx_px * math.radians(1)
+    if px_per_deg < LEAST_PX_PER_DEG:
+        return f"compared at {px_per_deg:.1f} pixels a degree, {LEAST_PX_PER_DEG} are needed"
+    return None
 
 
 def _compared(views: Sequence[RecordedView]) -> list[Camera]:
@@ -232,9 +240,14 @@ def _enclosed(
     *,
     only_wide: bool,
 ) -> Bool[np.ndarray, "height width"]:
-    """What groups of edges near the border of the image enclose with that border."""
+    """What groups of edges near the border of the image enclose with that border.
+
+    Where none goes across the image, they may together: a car ahead hides the middle of a bonnet's.
+    """
     height, width = edges.shape
     body = np.zeros((height, width), np.uint8)
+    outlines: list[np.ndarray | None] = []
+    found: list[Int[np.ndarray, "points 2"]] = []
     reach = round(GROUP_SHARE * width)
     window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     count, groups = cv2.connectedComponents(cv2.dilate(edges.astype(np.uint8), window))
@@ -244,7 +257,11 @@ def _enclosed(
             continue
         points = np.stack([column, row], axis=1).astype(np.int32)
         outline = None if only_wide else _outline_at_border(points, edges)
-        outline = _outline_across(points, edges.shape) if outline is None else outline
+        outlines.append(_outline_across(points, edges.shape) if outline is None else outline)
+        found.append(points)
+    if found and not (only_wide or any(_is_wide(points, width) for points in found)):
+        outlines.append(_outline_across(np.concatenate(found), edges.shape))
+    for outline in outlines:
         if outline is not None and cv2.contourArea(outline) >= LEAST_AREA * edges.size:
             cv2.fillPoly(body, [outline], 1)
     return body > 0
@@ -270,7 +287,7 @@ def _outline_across(
     """What lies below one edge across most of the image; None where there is no such edge."""
     height, width = shape
     columns = np.unique(points[:, 0])
-    if len(columns) < WIDE_SHARE * width:
+    if not _is_wide(points, width) or np.diff(columns).max() > GAP_SHARE * width:
         return None
     row = np.array([points[points[:, 0] == column, 1].min() for column in columns], np.float64)
     upper = np.interp(np.arange(width), columns, median_filter(row, round(GROUP_SHARE * width)))
@@ -279,6 +296,10 @@ def _outline_across(
     line = np.stack([np.arange(width), upper.round()], axis=1)
     ends = [(width - 1, height - 1), (0, height - 1)]
     return np.concatenate([line, ends]).astype(np.int32)
+
+
+def _is_wide(points: Int[np.ndarray, "points 2"], width: int) -> bool:
+    return len(np.unique(points[:, 0])) >= WIDE_SHARE * width
 
 
 def _hull_to_border(points: Int[np.ndarray, "points 2"], axis: int, at: int) -> np.ndarray:

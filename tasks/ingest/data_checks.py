@@ -168,7 +168,8 @@ def _exposure(scene: DrivingScene) -> list[Finding]:
 def _own_bodies(scene: DrivingScene, bodies: Bodies) -> list[Finding]:
     """Which cameras show the recording car, which a fit leaves out."""
     said = [in_words(name, body) for name, body in bodies().items()]
-    untold = own_body.cannot_be_told(scene.views)
+    whys = own_body.cannot_be_told(scene.views)
+    untold = {name: why for name, why in whys.items() if name not in bodies()}
     if len(untold) < len(scene.camera_names):
         who = "No other camera" if said else "No camera"
         said += [f"{who} {'that was checked ' if untold else ''}shows the recording car."]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpainter_models.checks import actors
+from lidarpainter_models.checks import actors, traffic
 from lidarpainter_models.checks.actors import (
     check_box_axes,
     check_box_points,
@@ -118,6 +118,27 @@ def test_camera_whose_images_show_nothing_is_found(scene, monkeypatch, level):
     verdict, detail = check_pictures(scene)
     assert verdict == ("fail" if level == 0 else "warn")
     assert detail.startswith(f"left_camera is {look} in all 3 images")
+
+
+def test_camera_whose_images_have_no_colour_is_found(scene, monkeypatch):
+    read, grey = scene.read_image, scene.camera_names[0]
+
+    def without_colour(view):
+        rgb_u8 = read(view)
+        return rgb_u8[..., :1].expand_as(rgb_u8) if view.camera_name == grey else rgb_u8
+
+    monkeypatch.setattr(scene, "read_image", without_colour)
+    verdict, said = check_pictures(scene)
+    assert verdict == "warn"
+    assert f"no colour in the images of {grey}:" in said
+
+
+def test_slow_traffic_without_any_box_is_said_not_to_be_checked(scene, monkeypatch):
+    monkeypatch.setattr(traffic, "_triples", lambda _scene: [(None, None, None)])
+    monkeypatch.setattr(traffic, "_num_moved", lambda *_sweeps: 0)
+    assert "not checked" not in traffic.check_traffic(scene)[1]
+    scene.tracks = ()
+    assert "less than its own length in 0.4 s was not checked" in traffic.check_traffic(scene)[1]
 
 
 def test_what_a_check_cannot_compute_ends_no_run(scene):

@@ -1,5 +1,7 @@
 """Images that were turned over or mirrored are said to be, and sound ones are not."""
 
+from dataclasses import replace
+
 import pytest
 
 from lidarpainter_models.checks.depth_edges import SceneEdges
@@ -30,3 +32,11 @@ def test_images_turned_over_are_said(way, street, monkeypatch):
     verdict, said = check_image_places(SceneEdges(street))
     assert verdict == "fail"
     assert f"{street.camera_names[0]}'s look {way}" in said
+
+
+def test_images_too_coarse_to_tell_are_said_not_to_be_checked(tmp_path):
+    coarse = replace(STREET, num_frames=4, width_px=96, height_px=54)
+    street = DrivingScene.open(write_street(coarse, tmp_path))
+    verdict, said = check_image_places(SceneEdges(street))
+    assert verdict == "ok"
+    assert "front_camera's are turned over was not checked (images of 1.7 pixels a degree" in said

@@ -65,6 +65,9 @@ def test_prefect_lives_in_the_store_of_who_has_no_home_and_has_not_said_where(tm
     assert os.environ["PREFECT_HOME"] == str(tmp_path / "one" / "prefect")
     keep_prefect_in(str(tmp_path / "two"))
     assert os.environ["PREFECT_HOME"] == str(tmp_path / "two" / "prefect")
+    os.environ["HOME"] = "/proc"  # is there, but holds no file of ours, not even root's
+    keep_prefect_in(str(tmp_path / "one"))
+    assert os.environ["PREFECT_HOME"] == str(tmp_path / "one" / "prefect")
     os.environ["PREFECT_HOME"] = "/mine"
     keep_prefect_in(str(tmp_path / "one"))
     assert os.environ["PREFECT_HOME"] == "/mine"

@@ -121,6 +121,23 @@ def test_the_car_is_found_where_it_is(body, options):
     assert cannot_be_told(street.views) == {}
 
 
+class InterruptedDrive(RoadDrive):
+    """The edge of the bonnet is washed out in its middle, as where a car drives ahead."""
+
+    def read_image(self, view):
+        image = super().read_image(view).numpy()
+        middle = np.s_[:, 145:175]
+        image[middle] = cv2.GaussianBlur(image, (0, 0), 40)[middle]
+        return torch.from_numpy(image)
+
+
+def test_one_edge_across_the_image_may_be_interrupted():
+    street = InterruptedDrive(bonnet())
+    (found,) = own_bodies(street, street.views).values()
+    found = on_grid(found, width_px=WIDTH_PX, height_px=HEIGHT_PX).numpy()
+    assert (found & bonnet()).sum() / (found | bonnet()).sum() > 0.8
+
+
 class BinnedDrive(RoadDrive):
     """A camera that bins its pixels from the middle of the drive on."""
 
@@ -173,6 +190,14 @@ def test_a_camera_whose_street_hardly_moves_cannot_be_told():
         for view in RoadDrive(bonnet(), num_frames=4).views
     ]
     assert "48 px wide" in cannot_be_told(coarse)["front"]
+
+
+def test_a_wide_lens_whose_images_are_coarse_cannot_be_told():
+    wide = [
+        replace(view, camera=replace(view.camera, fx_px=100.0, fy_px=100.0))
+        for view in RoadDrive(None).views
+    ]
+    assert "1.7 pixels a degree, 2.2 are needed" in cannot_be_told(wide)["front"]
 
 
 @pytest.fixture(scope="module")
