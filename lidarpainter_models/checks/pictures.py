@@ -1,6 +1,7 @@
 """Whether each camera's images show anything: black or even ones have no edge and no colour.
 
-Grey ones have edges, but sky is told from walls by its colour (`lidar.sky_masks`).
+Grey ones have edges, but sky is told from walls by its colour (`lidar.sky_masks`). An even border,
+as of a letterbox, stands before the street wherever the car is.
 """
 
 import cv2
@@ -16,6 +17,10 @@ MOST_EVEN_LEVELS = 3.0
 at night, blurred as it is here, it is 20 and more."""
 MOST_GREY_LEVELS = 1.0
 """Mean spread between the channels of an image without colour, of 255."""
+MOST_BORDER_LEVELS, LEAST_STEP_LEVELS = 12.0, 24.0
+"""Spread (10th to 90th percentile) of a row of a border over all images, and how far (median) the
+second row inside it differs: JPEG rings beside a border, and even sky ends here and there."""
+MOST_BORDER_SHARE = 0.45  # of an image's height or width, on each side
 BLACK, BLACK_LEVEL = "black", 16.0
 _NUM_LOOKED_AT = 8
 _SIZE_PX = (160, 90)
@@ -28,6 +33,9 @@ def check_pictures(scene: DrivingScene) -> tuple[Verdict, str]:
         said = "; ".join(f"{name} {words}" for name, words in blank.items())
         is_black = any(words.startswith(f"is {BLACK}") for words in blank.values())
         return "fail" if is_black else "warn", f"{said}: leave it out (ingest --cameras)"
+    shares = {name: _border_share(scene, name) for name in scene.camera_names}
+    if edged := [f"{name} ({share:.1%} of them)" for name, share in shares.items() if share]:
+        return "warn", f"an even border around the images of {', '.join(edged)}: cut it off"
     if grey := [name for name in scene.camera_names if _is_grey(scene, name)]:
         why = "sky is told by its colour, so little of it is found and a fit puts surfaces there"
         return "warn", f"no colour in the images of {', '.join(grey)}: {why}"
@@ -47,6 +55,29 @@ def blank_cameras(scene: DrivingScene) -> dict[str, str]:
                 look = BLACK if max(even) < BLACK_LEVEL else "of one even brightness"
                 said[name] = f"is {look} in all {len(views)} images"
     return said
+
+
+def _border_share(scene: DrivingScene, name: str) -> float:
+    """Part of a camera's images in an even border that stays the same."""
+    views = scene.views_of(name)
+    images = [scene.read_image(v).numpy() for v in views[:: -(-len(views) // _NUM_LOOKED_AT)]]
+    same_size = [image for image in images if image.shape == images[0].shape]
+    grey = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in same_size])
+    top, right, bottom, left = (_border_rows(np.rot90(grey, turn, (1, 2))) for turn in range(4))
+    height, width = grey.shape[1:]
+    return 1 - (height - top - bottom) * (width - left - right) / (height * width)
+
+
+def _border_rows(grey: UInt8[np.ndarray, "images height width"]) -> int:
+    """How many rows at the top of images are an even border."""
+    rows = grey[:, : 2 + round(MOST_BORDER_SHARE * grey.shape[1]), ::4].astype(np.float32)
+    low, middle, high = np.percentile(rows, (10, 50, 90), axis=(0, 2))
+    is_even = (high - low < MOST_BORDER_LEVELS) & (abs(middle - middle[0]) < MOST_BORDER_LEVELS)
+    count = int(is_even.argmin())  # 0 where all are
+    if not 0 < count < len(middle) - 1:
+        return 0
+    step = np.median(abs(rows[:, count + 1] - middle[0]))
+    return count if step > LEAST_STEP_LEVELS else 0
 
 
 def _is_grey(scene: DrivingScene, name: str) -> bool:

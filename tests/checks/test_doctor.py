@@ -120,6 +120,21 @@ def test_camera_whose_images_show_nothing_is_found(scene, monkeypatch, level):
     assert detail.startswith(f"left_camera is {look} in all 3 images")
 
 
+def test_even_border_around_images_is_found(scene, monkeypatch):
+    read, edged = scene.read_image, scene.camera_names[0]
+
+    def with_border(view):
+        image = read(view).clone()
+        if view.camera_name == edged:
+            image[:2], image[-2:], image[:, :2], image[:, -2:] = 0, 0, 0, 0
+        return image
+
+    monkeypatch.setattr(scene, "read_image", with_border)
+    verdict, said = check_pictures(scene)
+    assert verdict == "warn"
+    assert said.startswith(f"an even border around the images of {edged} (")
+
+
 def test_camera_whose_images_have_no_colour_is_found(scene, monkeypatch):
     read, grey = scene.read_image, scene.camera_names[0]
 
