@@ -33,6 +33,12 @@ def check_pictures(scene: DrivingScene) -> tuple[Verdict, str]:
         said = "; ".join(f"{name} {words}" for name, words in blank.items())
         is_black = any(words.startswith(f"is {BLACK}") for words in blank.values())
         return "fail" if is_black else "warn", f"{said}: leave it out (ingest --cameras)"
+    empty = {
+        name: sum(_even_level(scene, view) is not None for view in scene.views_of(name))
+        for name in scene.camera_names
+    }
+    if some := [f"{count} of {name}'s images" for name, count in empty.items() if count]:
+        return "warn", f"{', '.join(some)} show nothing, among others that do: leave them out"
     shares = {name: _border_share(scene, name) for name in scene.camera_names}
     if edged := [f"{name} ({share:.1%} of them)" for name, share in shares.items() if share]:
         return "warn", f"an even border around the images of {', '.join(edged)}: cut it off"

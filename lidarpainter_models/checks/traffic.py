@@ -17,9 +17,12 @@ from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Sweep
+from lidarpainter_models.scenes.tracks import ActorTrack
 
 MOST_UNLABELLED = 0.5
 """Things a sweep that move without a box, beyond which it is said."""
+MOST_DRIFT_M = 3.0
+"""What goes farther from its first box to its last does not stand."""
 _REACH_M = 35.0
 _APART_S = (0.4, 1.5)
 _NUM_SWEEPS = 8
@@ -36,7 +39,12 @@ _BOX_MARGIN_M = 0.6
 
 
 def check_traffic(scene: DrivingScene) -> tuple[Verdict, str]:
-    """Whether moving things are boxed."""
+    """Whether moving things are boxed, and said to move."""
+    if drives := [track.actor_id for track in scene.tracks if _drives_though_standing(track)]:
+        return "warn", (
+            f"{len(drives)} actors said to stand go farther than {MOST_DRIFT_M:.0f} m "
+            f"({drives[0]}, ...): a fit holds them for street; say that they move"
+        )
     triples = _triples(scene)
     if not triples:
         return "ok", "not checked: too few sweeps half a second apart"
@@ -54,6 +62,11 @@ def check_traffic(scene: DrivingScene) -> tuple[Verdict, str]:
             f"{_APART_S[0]:.1f} s was not checked"
         )
     return "ok", detail
+
+
+def _drives_though_standing(track: ActorTrack) -> bool:
+    way_m = track.world_from_box[-1, :3, 3] - track.world_from_box[0, :3, 3]
+    return not track.is_moving and float(way_m.norm()) > MOST_DRIFT_M
 
 
 def _triples(scene: DrivingScene) -> list[tuple[Sweep, Sweep, Sweep]]:

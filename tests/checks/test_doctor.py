@@ -120,6 +120,24 @@ def test_camera_whose_images_show_nothing_is_found(scene, monkeypatch, level):
     assert detail.startswith(f"left_camera is {look} in all 3 images")
 
 
+def test_one_black_image_among_others_is_found(scene, monkeypatch):
+    read, black = scene.read_image, scene.views[0]
+    monkeypatch.setattr(scene, "read_image", lambda view: read(view) * (0 if view == black else 1))
+    verdict, said = check_pictures(scene)
+    assert verdict == "warn"
+    assert said.startswith(f"1 of {black.camera_name}'s images show nothing")
+
+
+def test_actor_that_drives_though_it_is_said_to_stand_is_found(scene):
+    moved = next(track for track in scene.tracks if track.is_moving)
+    place = moved.world_from_box.clone()
+    place[-1, 0, 3] += 20
+    scene.tracks = (replace(moved, is_moving=False, world_from_box=place),)
+    verdict, said = traffic.check_traffic(scene)
+    assert verdict == "warn"
+    assert f"1 actors said to stand go farther than 3 m ({moved.actor_id}" in said
+
+
 def test_even_border_around_images_is_found(scene, monkeypatch):
     read, edged = scene.read_image, scene.camera_names[0]
 
