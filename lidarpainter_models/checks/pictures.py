@@ -64,12 +64,19 @@ def blank_cameras(scene: DrivingScene) -> dict[str, str]:
 
 
 def _border_share(scene: DrivingScene, name: str) -> float:
-    """Part of a camera's images in an even border that stays the same."""
+    """Part of a camera's images in an even border that stays the same, on sides that face another.
+
+    On one side alone it may be what is there: a white sky over a level horizon, a dark bonnet.
+    """
     views = scene.views_of(name)
     images = [scene.read_image(v).numpy() for v in views[:: -(-len(views) // _NUM_LOOKED_AT)]]
     same_size = [image for image in images if image.shape == images[0].shape]
     grey = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in same_size])
     top, right, bottom, left = (_border_rows(np.rot90(grey, turn, (1, 2))) for turn in range(4))
+    if not (top and bottom):
+        top = bottom = 0
+    if not (left and right):
+        left = right = 0
     height, width = grey.shape[1:]
     return 1 - (height - top - bottom) * (width - left - right) / (height * width)
 

@@ -153,6 +153,18 @@ def test_even_border_around_images_is_found(scene, monkeypatch):
     assert said.startswith(f"an even border around the images of {edged} (")
 
 
+def test_white_sky_over_a_level_horizon_is_no_border(scene, monkeypatch):
+    read = scene.read_image
+
+    def with_sky(view):
+        image = read(view).clone()
+        image[: len(image) // 3] = 255
+        return image
+
+    monkeypatch.setattr(scene, "read_image", with_sky)
+    assert "border" not in check_pictures(scene)[1]
+
+
 def test_camera_whose_images_have_no_colour_is_found(scene, monkeypatch):
     read, grey = scene.read_image, scene.camera_names[0]
 
