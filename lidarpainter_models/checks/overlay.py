@@ -23,19 +23,23 @@ def draw_overlay(scene: DrivingScene, view: RecordedView) -> UInt8[Tensor, "heig
     """The recorded image with its frame's points coloured by depth and all boxes in view.
 
     Boxes stand where they are at the moment of the exposure: green moves, white is parked, the
-    cross marks the front of the actor.
+    cross marks the front of the actor. Small images are enlarged, so that points do not hide them.
     """
-    image = np.ascontiguousarray(scene.read_image(view).numpy())
+    times = -(-_LEGEND_WIDTH_PX // view.camera.width_px)
+    camera = view.camera.resized(
+        width_px=times * view.camera.width_px, height_px=times * view.camera.height_px
+    )
+    image = cv2.resize(scene.read_image(view).numpy(), (camera.width_px, camera.height_px))
     if scene.sweeps_of(view.frame_index):
-        _draw_points(image, view.camera, scene.read_positions(view.frame_index))
-    draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
+        _draw_points(image, camera, scene.read_positions(view.frame_index))
+    draw_boxes(image, camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(image)
 
 
-def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "taller wider 3"]:
+def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "taller width 3"]:
     """The overlay over a strip that says what its colours mean."""
     image = overlay.numpy()
-    strip = np.full((_LEGEND_PX, max(image.shape[1], _LEGEND_WIDTH_PX), 3), 30, np.uint8)
+    strip = np.full((_LEGEND_PX, image.shape[1], 3), 30, np.uint8)
     ramp = np.tile(np.arange(_RAMP_PX) * 255 // _RAMP_PX, (12, 1)).astype(np.uint8)
     strip[8:20, 150 : 150 + _RAMP_PX] = cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)[..., ::-1]
     words = (
@@ -47,8 +51,7 @@ def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "tall
     )
     for text, left, colour in words:
         cv2.putText(strip, text, (left, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
-    beside = np.zeros((image.shape[0], strip.shape[1] - image.shape[1], 3), np.uint8)
-    return torch.from_numpy(np.concatenate([np.concatenate([image, beside], axis=1), strip]))
+    return torch.from_numpy(np.concatenate([image, strip]))
 
 
 def draw_boxes(
