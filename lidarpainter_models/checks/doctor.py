@@ -180,9 +180,10 @@ def check_timestamps(scene: DrivingScene) -> tuple[Verdict, str]:
         for before, view in pairwise(scene.views_of(name)):
             if view.timestamp_ns <= before.timestamp_ns:
                 early_ms = (before.timestamp_ns - view.timestamp_ns) / 1e6
+                how_old = f"{early_ms:.0f} ms older than" if early_ms else "as old as"
                 return "fail", (
                     f"the times of {name} do not ascend: frame {view.frame_index} has an image "
-                    f"{early_ms:.0f} ms older than frame {before.frame_index}'s: give each its own "
+                    f"{how_old} frame {before.frame_index}'s: give each its own "
                     "time, and leave an image out that was there before"
                 )
     if len(steps_s) == 0:
