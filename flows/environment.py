@@ -9,6 +9,7 @@ import sys
 import tempfile
 import warnings
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -67,7 +68,7 @@ def keep_prefect_in(store: str) -> None:
     if os.environ.get(PREFECT_HOME, "") not in {"", *_chosen_homes}:
         return
     home = home_folder()
-    if home is not None and home.is_dir() and _can_write(home):
+    if home is not None and os.path.isdir(home) and _can_write(home):  # noqa: PTH112 raises nothing
         os.environ.pop(PREFECT_HOME, None)
         return
     place = cache_folder() if store.startswith("s3:/") else expanded(store)
@@ -84,24 +85,35 @@ def keep_prefect_in(store: str) -> None:
 def _reach_own_servers() -> None:
     """Have clients reach servers on this machine past any proxy that the environment names.
 
-    A proxy whose address is none is left out and named: HTTP clients end with it, whomever they
-    are to reach.
+    A proxy whose address is none, or of a kind that Prefect's client (httpx) cannot speak to, is
+    left out and named: the client ends with it, whomever it is to reach.
     """
     for name in [name for name in os.environ if name.lower() in PROXIES]:
-        if not _is_address(os.environ[name]):
-            said = f"{name} is left out: {os.environ.pop(name)!r} is no address of a proxy"
-            sys.stderr.write(f"lidarpainter: {said} (http://HOST:PORT)\n")
+        if why := _why_unusable(os.environ[name]):
+            said = f"{name} is left out: {os.environ.pop(name)!r} {why}"
+            sys.stderr.write(f"lidarpainter: {said}\n")
     known = (os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or "").split(",")
     hosts = dict.fromkeys(filter(None, (*map(str.strip, known), *LOOPBACK)))
     os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(hosts)
 
 
-def _is_address(proxy: str) -> bool:
-    """Whether a host is named, with a number as its port if any; an empty text names no proxy."""
-    with suppress(ValueError):
+def _why_unusable(proxy: str) -> str | None:
+    """What is wrong with the address of a proxy; None of a good one, and of an empty text."""
+    if not proxy:
+        return None
+    try:
         parts = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
-        return not proxy or (bool(parts.hostname) and parts.port != 0)
-    return False
+        is_address = bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        is_address = False
+    if not is_address:
+        return "is no address of a proxy (http://HOST:PORT)"
+    if parts.scheme.startswith("socks5"):
+        has_socks = find_spec("socksio") is not None
+        return None if has_socks else "needs the package socksio: pip install socksio"
+    if parts.scheme not in ("http", "https"):
+        return "is of a kind that is not spoken here, expected http://HOST:PORT"
+    return None
 
 
 def _keep_freed_memory() -> None:

@@ -192,7 +192,8 @@ class Fuzz:
         first = next((one for one in outcomes if one.fault or one.refusal), Outcome())
         if first.fault or not first.refusal:
             return first
-        left = [one for one in (store, store.parent) if one != root and one.is_dir()]
+        # os's own test raises nothing where a name is too long
+        left = [one for one in (store, store.parent) if one != root and os.path.isdir(one)]  # noqa: PTH112
         is_half = any(one.name == "manifest.json" for folder in left for one in folder.rglob("*"))
         is_first = outcomes[0].refusal == first.refusal
         return replace(first, fault="refused, but written") if is_half and is_first else first

@@ -5,6 +5,7 @@ import pytest
 from catalog.errors import CatalogError
 from catalog.folders import home_folder
 from catalog.store import open_store
+from flows import environment
 from flows.cli.main import main
 from flows.environment import keep_prefect_in, prepare_environment
 from tasks.job_limits import usable_cores
@@ -45,13 +46,25 @@ def test_own_servers_are_reached_past_a_proxy(known):
 
 
 @pytest.mark.usefixtures("bare_environment")
-@pytest.mark.parametrize("proxy", ["::not a proxy::", "http://", "proxy:80x"])
-def test_a_proxy_whose_address_is_none_is_left_out_and_named(proxy, capsys):
+@pytest.mark.parametrize(
+    "proxy", ["::not a proxy::", "http://", "proxy:80x", "socks4://proxy.example:1080"]
+)
+def test_a_proxy_that_cannot_be_used_is_left_out_and_named(proxy, capsys):
     os.environ["HTTP_PROXY"], os.environ["https_proxy"] = proxy, "proxy.example:3128"
     prepare_environment()
     assert "HTTP_PROXY" not in os.environ
     assert os.environ["https_proxy"] == "proxy.example:3128"
     assert f"HTTP_PROXY is left out: {proxy!r}" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("bare_environment")
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_a_socks_proxy_stays_where_its_package_is_installed(is_installed, monkeypatch, capsys):
+    monkeypatch.setattr(environment, "find_spec", lambda _name: object() if is_installed else None)
+    os.environ["ALL_PROXY"] = "socks5://proxy.example:1080"
+    prepare_environment()
+    assert ("ALL_PROXY" in os.environ) == is_installed
+    assert ("pip install socksio" in capsys.readouterr().err) != is_installed
 
 
 @pytest.mark.usefixtures("bare_environment")
