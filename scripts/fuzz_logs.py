@@ -253,7 +253,7 @@ def _fitted(scene: DrivingScene) -> Outcome:
     return Outcome(
         psnr=psnr,
         doubts=frozenset(doubts),
-        fault="" if math.isfinite(psnr) else f"held-out PSNR is {psnr}",
+        fault=f"held-out PSNR is {psnr}" if math.isnan(psnr) else "",  # black images: inf
     )
 
 
