@@ -41,6 +41,7 @@ LEAST_PX_PER_DEG = 2.2
 """In coarser images, behind wide lenses, edges of bodies blur and are lost; what is found stays."""
 MOST_HEIGHT_M = 3.0
 """No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
+LEAST_HIDDEN = 0.05  # of where a body would show: so much behind other cars is worth saying
 LEAST_EDGE = 1.5  # grey levels a pixel that stay
 LEAST_ACROSS = 0.3
 """Of the whole change of brightness, so much is along the epipolar line: lane markings and curbs
@@ -86,6 +87,26 @@ def cannot_be_told(views: Sequence[RecordedView]) -> dict[str, str]:
     names = sorted({view.camera_name for view in views})
     whys = {name: _too_little([v for v in views if v.camera_name == name]) for name in names}
     return {name: why for name, why in whys.items() if why is not None}
+
+
+def behind_traffic(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str, float]:
+    """The share of where a body would show that other cars hide in most images, by camera.
+
+    Nothing can be told there. Cameras of which less than `LEAST_HIDDEN` is hidden are left out.
+    """
+    moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    shares = {}
+    for name in sorted({view.camera_name for view in views}):
+        own = _far_apart([view for view in views if view.camera_name == name])
+        cameras = _compared(own)
+        pixels = [
+            moving.pixels(camera, view.timestamp_ns).numpy()
+            for camera, view in zip(cameras, own, strict=True)
+        ]
+        is_hidden = np.mean(pixels, axis=0) > 0.5
+        if (looked_at := _would_have_moved(cameras)).any():
+            shares[name] = float(is_hidden[looked_at].mean())
+    return {name: share for name, share in shares.items() if share >= LEAST_HIDDEN}
 
 
 def _too_little(views: Sequence[RecordedView]) -> str | None:

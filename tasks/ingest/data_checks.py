@@ -174,6 +174,11 @@ def _own_bodies(scene: DrivingScene, bodies: Bodies) -> list[Finding]:
         who = "No other camera" if said else "No camera"
         said += [f"{who} {'that was checked ' if untold else ''}shows the recording car."]
     said += [f"{name} was not checked ({why})." for name, why in untold.items()]
+    said += [
+        f"{share:.0%} of where {name} would show it was not checked (other cars drive there)."
+        for name, share in own_body.behind_traffic(scene, scene.views).items()
+        if name not in untold
+    ]
     return [Finding("own body", "ok", " ".join(said))]
 
 

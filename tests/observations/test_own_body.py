@@ -17,6 +17,7 @@ from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.own_body import (
+    behind_traffic,
     cannot_be_told,
     in_words,
     on_grid,
@@ -136,6 +137,19 @@ def test_one_edge_across_the_image_may_be_interrupted():
     (found,) = own_bodies(street, street.views).values()
     found = on_grid(found, width_px=WIDTH_PX, height_px=HEIGHT_PX).numpy()
     assert (found & bonnet()).sum() / (found | bonnet()).sum() > 0.8
+
+
+def test_what_cars_alongside_hide_is_said():
+    street = RoadDrive(mirror(), looks=LOOK_FORWARD)
+    assert behind_traffic(street, street.views) == {}
+    track = ToyStreet(len(street.views)).tracks[0]
+    beside = [
+        rigid_from_rotation(torch.eye(3), torch.tensor([0.6 * frame + 6, 2.0, 1.0])).double()
+        for frame in range(len(street.views))
+    ]
+    street.tracks = (replace(track, world_from_box=torch.stack(beside)),)
+    (share,) = behind_traffic(street, street.views).values()
+    assert 0.05 < share < 0.5
 
 
 class BinnedDrive(RoadDrive):
