@@ -175,7 +175,7 @@ def _own_bodies(scene: DrivingScene, bodies: Bodies) -> list[Finding]:
         said += [f"{who} {'that was checked ' if untold else ''}shows the recording car."]
     said += [f"{name} was not checked ({why})." for name, why in untold.items()]
     said += [
-        f"{share:.0%} of where {name} would show it was not checked (other cars drive there)."
+        f"Of where {name} would show it, {share:.0%} was not checked (other cars drive there)."
         for name, share in own_body.behind_traffic(scene, scene.views).items()
         if name not in untold
     ]

@@ -14,6 +14,7 @@ from tiny_diffusion import write_model
 from lidarpainter_models.errors import ConfigError, MissingPackageError, WeightsError
 from lidarpainter_models.painter import selection
 from lidarpainter_models.painter.baselines import UnpaintedPainter
+from lidarpainter_models.painter.known_painters import WIRINGS
 from lidarpainter_models.painter.one_step import loading
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.config import PAPER, PRESETS
@@ -339,3 +340,7 @@ def test_another_model_of_the_same_shape_is_found_out(trained, tmp_path):
     write_model(tmp_path / "small-turbo", seed=1)
     with pytest.raises(WeightsError, match="trained on another model"):
         load_one_step(str(path))
+
+
+def test_every_preset_can_be_named_after_a_model():
+    assert tuple(PRESETS) == WIRINGS
