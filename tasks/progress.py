@@ -8,6 +8,10 @@ not hear each other.
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lidarpainter_models.viewing.watching import Watch
 
 
 class ProgressListener:
@@ -15,6 +19,9 @@ class ProgressListener:
 
     A stage is named by the word used in `seconds` of the results.
     """
+
+    watch: "Watch | None" = None
+    """What shows running fits, where somebody watches."""
 
     def started(self, stage: str) -> None:
         """A stage begins."""

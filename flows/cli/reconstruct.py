@@ -50,6 +50,7 @@ evaluate: Score the scene on held-out views, or leave that to `lidarpainter eval
 report: Write the page about the run, or leave it out.
 config: TOML file with preset, painter and set, as a fleet's manifest has them; options given here
   count more.
+view: Show the scene in a browser while it is fitted; only this machine can reach it.
 tensorboard: Folder for TensorBoard event files with the losses of all fits; each fit's artefact has
   them as history.csv anyway.
 """
@@ -73,6 +74,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     report: Annotated[bool, typer.Option("--report/--no-report")] = True,
     settings: Settings = None,
     config: Path | None = None,
+    view: bool = False,
     tensorboard: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
@@ -91,9 +93,9 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     from flows.presets import preset as preset_named
 
     check_tensorboard(tensorboard)
-    asked = {} if config is None else read_config(config)
+    asked = read_config(config)
     parameters = preset_named(preset or asked.get("preset", "preview"), scene)
-    changes: dict[str, Any] = {
+    given: dict[str, Any] = {
         "painter": painter or asked.get("painter"),
         "device": device,
         "rounds": rounds,
@@ -102,27 +104,26 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         "judge": evaluate,
         "report": report,
     }
-    changes = {name: value for name, value in changes.items() if value is not None}
-    if shift is not None or up is not None:
-        changes["novel"] = shifted(parameters.novel, shift, up)
-    parameters = with_overrides(
-        with_changes(parameters, changes), [*asked.get("set", []), *(settings or [])]
-    )
+    changes = {name: value for name, value in given.items() if value is not None}
+    parameters = with_changes(parameters, changes | shifted(parameters.novel, shift, up))
+    parameters = with_overrides(parameters, [*asked.get("set", []), *(settings or [])])
     parameters = with_changes(parameters, of_fits(parameters, seed, memory, time_limit))
     check_painter(parameters.painter)
     say_status(f"opening {scene}")
-    result = run_reconstruction(parameters, store := existing_store())
-    if tensorboard is not None:
-        write_events(store, result, tensorboard)
+    store = existing_store()
+    result = run_reconstruction(parameters, store, is_watched=view)
+    write_events(store, result, tensorboard)
     (print_json if as_json else show)(result)
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """Read what a file for `--config` asks for, by its keys.
+def read_config(path: Path | None) -> dict[str, Any]:
+    """Read what a file for `--config` asks for, by its keys; nothing where there is no file.
 
     Raises:
         ConfigError: it cannot be read, is no TOML, or holds what such a file does not.
     """
+    if path is None:
+        return {}
     from flows.fleet.manifest import read_toml
 
     values = read_toml(path)
@@ -154,8 +155,13 @@ def check_tensorboard(folder: Path | None) -> None:
         ) from None
 
 
-def write_events(store: "Store", result: dict[str, Any], folder: Path) -> None:
-    """Write the losses of every fit of a run as event files, in a folder for each fit."""
+def write_events(store: "Store", result: dict[str, Any], folder: Path | None) -> None:
+    """Write the losses of every fit of a run as event files, in a folder for each fit.
+
+    Nothing is written where there is no folder.
+    """
+    if folder is None:
+        return
     from torch.utils.tensorboard import SummaryWriter
 
     from catalog.artefacts import ArtefactRef
@@ -171,16 +177,23 @@ def write_events(store: "Store", result: dict[str, Any], folder: Path) -> None:
                     writer.add_scalar(name, entry[name], int(entry["step"]))
 
 
-def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN401 - imported late
-    """Guidance settings that paint at the given distances instead.
+def shifted(
+    novel: Any,  # noqa: ANN401 - imported late
+    shift: str | None,
+    up: str | None,
+) -> dict[str, Any]:
+    """Guidance settings that paint at the given distances, by their name; none without a distance.
 
     Raises:
         ConfigError: a distance is no positive number.
     """
+    if shift is None and up is None:
+        return {}
     from lidarpainter_models.geometry.shifts import Shift
 
     sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
-    return replace(novel, shifts=(*sideways, *(Shift(up_m=metres) for metres in _distances(up))))
+    upwards = [Shift(up_m=metres) for metres in _distances(up)]
+    return {"novel": replace(novel, shifts=(*sideways, *upwards))}
 
 
 def of_fits(

@@ -1,8 +1,9 @@
 """Run a reconstruction from a command: with a Prefect server, and progress on stderr."""
 
 import json
+import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
 from flows.server import prefect_server
 from flows.time_prediction import expected_seconds
+from tasks.progress import ProgressListener
 
 if TYPE_CHECKING:
     from flows.parameters import ReconstructParameters
@@ -18,8 +20,13 @@ if TYPE_CHECKING:
 SERVER = "starting Prefect's server, which orders and records the stages (a few seconds)"
 
 
-def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dict[str, Any]:
-    """Reconstruct one scene of the store; what is known already is not asked of a server."""
+def run_reconstruction(
+    parameters: "ReconstructParameters", store: Store, *, is_watched: bool = False
+) -> dict[str, Any]:
+    """Reconstruct one scene of the store; what is known already is not asked of a server.
+
+    Where it `is_watched`, its fits are shown in a browser while they run.
+    """
     from flows.recall import recalled
 
     if (known := recalled(parameters, store.address)) is not None:
@@ -28,7 +35,13 @@ def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dic
 
     check_inputs(parameters, store.address)  # before a server is started for nothing
     scene = next((r for r in store.rows("scenes") if r["scene_id"] == parameters.scene), None)
-    with _running(store, parameters, _num_views(scene, parameters.train_cameras)):
+    num_views = _num_views(scene, parameters.train_cameras)
+    with _running(store, parameters, num_views) as listener, ExitStack() as stack:
+        if is_watched:
+            from lidarpainter_models.viewing.watching import watching
+
+            listener.watch, address = stack.enter_context(watching(label=parameters.scene))
+            sys.stderr.write(f"{address} shows the fits of this run while they run\n")
         return reconstruct_flow(parameters, store.address)
 
 
@@ -44,7 +57,9 @@ def run_demo(
 
 
 @contextmanager
-def _running(store: Store, parameters: "ReconstructParameters", num_views: float) -> Iterator[None]:
+def _running(
+    store: Store, parameters: "ReconstructParameters", num_views: float
+) -> Iterator[ProgressListener]:
     """Start a server, and show the stages of a run whose scene has so many views."""
     store.make()
     scenes = {row["scene_id"]: row for row in store.rows("scenes")}
@@ -55,8 +70,8 @@ def _running(store: Store, parameters: "ReconstructParameters", num_views: float
     expected, is_told = expected_seconds(parameters, num_views, past)
     say_status(SERVER)
     log = store.root / "logs" / "prefect.log"
-    with prefect_server(log), shown_progress(expected, is_told_by_past=is_told):
-        yield
+    with prefect_server(log), shown_progress(expected, is_told_by_past=is_told) as listener:
+        yield listener
 
 
 def _cameras(row: dict[str, Any]) -> Sequence[str] | None:

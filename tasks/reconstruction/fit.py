@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,7 +28,7 @@ from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import opened
-from tasks.progress import Progress
+from tasks.progress import Progress, listener
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
@@ -37,6 +38,8 @@ from tasks.weights import file_digests
 _LOG = logging.getLogger("lidarpainter")
 CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
+FIRST_LOOK = 0.1
+"""Part of the steps after which the scene is shown for the first time."""
 LOOK_FILE = "first-look.png"
 """The scene after a tenth of its first fit, where the checkpoints lie, until the fit is done."""
 FIT_OF_ROUND = 0.7
@@ -141,6 +144,41 @@ def _stage(
     )
 
 
+class _Looks:
+    """Shows a running fit: its first look in a file, and all of it to whoever watches."""
+
+    said = ""
+    """Where the first look lies, once there is one."""
+
+    def __init__(self, seen: SceneObservations, file: Path, *, is_first_fit: bool) -> None:
+        self._seen, self._file, self._watch = seen, file, listener().watch
+        self._is_expected = is_first_fit
+
+    def is_due(self, share_of_steps: float) -> bool:
+        """Whether the first look is to be had, or whoever watches wants to see more."""
+        is_watched = self._watch is not None and self._watch.is_due()
+        return is_watched or (self._is_expected and share_of_steps >= FIRST_LOOK)
+
+    def show(self, scene: GaussianScene) -> None:
+        """Write the first look if it is not there, and show the scene to whoever watches."""
+        if self._is_expected:
+            self._is_expected = False
+            self._write(scene)
+        if self._watch is not None:
+            self._watch.show(scene, self._seen.views)
+
+    def _write(self, scene: GaussianScene) -> None:
+        view = self._seen.views[len(self._seen.views) // 2]
+        image = scene.render(
+            view.camera, view.timestamp_ns, camera_name=view.key[1], view_key=view.key
+        )
+        rgb_u8 = (image.rgb.clamp(0, 1).cpu() * 255).round().to(torch.uint8).numpy()
+        # by OpenCV alone: how files are exported is no part of a fit's key
+        cv2.imwrite(str(self._file), cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2BGR))
+        self.said = f", first look: {self._file}"
+        _LOG.info("a fit%s", self.said)
+
+
 def _build(place: Workplace, progress: Progress, *, sources: _Sources) -> dict[str, Any]:
     result = _run(place, progress, sources, sources.observations(), sources.start())
     save_scene(place.output, result.scene, result.history)
@@ -175,24 +213,12 @@ def _run(
 
     A `start` stays as it is.
     """
-    plan, shown = "", ""
-
-    def look(scene: GaussianScene) -> None:
-        nonlocal shown
-        view = seen.views[len(seen.views) // 2]
-        image = scene.render(
-            view.camera, view.timestamp_ns, camera_name=view.key[1], view_key=view.key
-        )
-        path = place.scratch / LOOK_FILE
-        rgb_u8 = (image.rgb.clamp(0, 1).cpu() * 255).round().to(torch.uint8).numpy()
-        # by OpenCV alone: how files are exported is no part of a fit's key
-        cv2.imwrite(str(path), cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2BGR))
-        shown = f", first look: {path}"
-        _LOG.info("a fit%s", shown)
+    plan = ""
+    looks = _Looks(seen, place.scratch / LOOK_FILE, is_first_fit=start is None)
 
     def told(now: FitProgress) -> None:
         nonlocal plan
-        note = f"{plan}{shown}"
+        note = f"{plan}{looks.said}"
         if now.placed is not None:
             note = f"placing Gaussians, {100 * now.placed:.0f} %"
         elif now.entry is not None:
@@ -211,7 +237,7 @@ def _run(
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
         ),
         progress=told,
-        first_look=None if start else look,
+        onlooker=looks,
         perceptual=sources.perceptual() if sources.perceptual else None,
         device=sources.device,
     )

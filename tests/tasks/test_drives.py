@@ -18,14 +18,20 @@ from websockets.sync.client import connect
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.view_requests import ViewRequest
+from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.viewing import servers
+from lidarpainter_models.viewing import watching as viewing_settings
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
 from lidarpainter_models.viewing.controls import CLICK_HINT
 from lidarpainter_models.viewing.drive_nodes import SEAT_FROM_CAMERA
 from lidarpainter_models.viewing.servers import local_server
 from lidarpainter_models.viewing.viewer import LiveViewer
+from lidarpainter_models.viewing.watching import Watch
+from tasks.progress import ProgressListener, listening
+from tasks.reconstruction.fit import fit
+from tasks.stored import load_observations, load_scene
 from tasks.views.drive import shown_drive, write_page
 
 RECORDED = ViewRequest(trajectory=parse_trajectory("recorded"))
@@ -295,3 +301,25 @@ def test_page_drives_the_recorded_path_and_one_beside_it(viewed, tmp_path, capfd
 def test_page_along_no_camera_is_refused(run, viewed):
     with pytest.raises(SceneError, match="no camera"):
         shown_drive(viewed, replace(RECORDED, camera="rear"), {"painted": run.final})
+
+
+def test_a_running_fit_is_shown_and_stays_the_same(server, store, parameters, stages, monkeypatch):
+    monkeypatch.setattr(viewing_settings, "EVERY_S", 0.0)
+    monkeypatch.setattr(viewing_settings, "SHARE", 1.0)
+    seen, config = stages["prepare"].ref, replace(parameters.fit, seed=7)
+    listener = ProgressListener()
+    listener.watch = Watch(server)
+    with listening(listener):
+        fitted = fit.fn(parameters.run_spec(store.root), "fit", seen, config)
+    there = [name for name in range(1, 1000) if server.scene.get_handle_by_name(f"/fit/{name}")]
+    assert len(there) == 1
+    assert there[0] > 2
+    assert torch.allclose(
+        invert_rigid(pose(server.scene.get_handle_by_name("/fit"))) @ SEAT_FROM_CAMERA,
+        load_observations(store, seen).views[0].camera.world_from_camera,
+        atol=1e-5,
+    )
+    alone = fit_gaussians(load_observations(store, seen), config).scene
+    watched = load_scene(store, fitted.ref)
+    assert torch.equal(watched.gaussians.means, alone.gaussians.means)
+    assert torch.equal(watched.gaussians.sh, alone.gaussians.sh)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -36,8 +37,6 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
-FIRST_LOOK = 0.1
-"""Part of the steps after which the scene is shown for the first time."""
 LAMPS_AT = 0.6
 """Part of the steps after which lamps are looked for: Gaussians are split, colours have settled."""
 LAMP_STEPS = 0.1
@@ -59,8 +58,21 @@ class FitProgress:
     """Newest entry of the history, if it has one."""
 
 
-FirstLook = Callable[[GaussianScene], None]
 Progress = Callable[[FitProgress], None]
+
+
+@runtime_checkable
+class Onlooker(Protocol):
+    """Who sees a fit while it runs, which changes no bit of what comes out."""
+
+    def is_due(self, share_of_steps: float) -> bool:
+        """Whether to show it the scene now, when so much of the steps (0 to 1) is done."""
+
+    def show(self, scene: GaussianScene) -> None:
+        """Show it the scene, whose Gaussians out of view lag a few steps behind.
+
+        The fit waits meanwhile, and goes on with the same tensors.
+        """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +95,7 @@ class _Inputs:
     guidance: Sequence[GuidanceView]
     checkpoints: CheckpointFolder | None
     progress: Progress
-    first_look: FirstLook | None
+    onlooker: Onlooker | None
     perceptual: Perceptual | None
 
 
@@ -95,7 +107,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     guidance: Sequence[GuidanceView] = (),
     checkpoints: CheckpointFolder | None = None,
     progress: Progress | None = None,
-    first_look: FirstLook | None = None,
+    onlooker: Onlooker | None = None,
     perceptual: Perceptual | None = None,
     device: torch.device | None = None,
 ) -> FitResult:
@@ -109,7 +121,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
         guidance: painted views.
         checkpoints: where to keep the running fit; an existing checkpoint is taken up.
         progress: told about the plan, the first scene and every step.
-        first_look: shown the scene after the first tenth of the steps.
+        onlooker: shown the scene after steps at which it wants to see it.
         perceptual: distance of a rendered and a true image, such as LPIPS, weighted by
             `losses.perceptual` on recorded views and `guidance.perceptual` on painted ones.
         device: where the fit runs and the scene then lies; None is where the start lies. Where its
@@ -128,7 +140,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
         guidance=guidance,
         checkpoints=checkpoints,
         progress=progress or (lambda _: None),
-        first_look=first_look,
+        onlooker=onlooker,
         perceptual=perceptual,
     )
 
@@ -168,7 +180,7 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
     if plan.keeps_images:
         full, half = ([image.to(plan.device) for image in images] for images in (full, half))
         guidance = [view.to(plan.device) for view in guidance]
-    clock, look = FitClock(state.step, config), inputs.first_look
+    clock, onlooker = FitClock(state.step, config), inputs.onlooker
     while state.step < state.steps:
         is_half = state.step < config.half_resolution * state.steps
         row = state.next_view(plan.surface.groups)
@@ -178,9 +190,8 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
             state.steps = clock.steps_in_time(state.step, state.steps)
             state.log()
         _tell(inputs.progress, plan, state)
-        if look is not None and state.step >= state.steps * FIRST_LOOK:
-            look(state.caught_up())
-            look = None
+        if onlooker is not None and onlooker.is_due(state.step / state.steps):
+            onlooker.show(state.scene)  # to catch up now would round what is out of view anew
         if inputs.checkpoints is not None and inputs.checkpoints.is_due:
             inputs.checkpoints.save(*state.keep())
     return FitResult(

@@ -332,11 +332,17 @@ def test_a_fit_out_of_time_ends_early_with_schedules_of_as_many_steps(world, mon
 def test_a_fit_tells_its_plan_first_and_how_far_it_is(world, undisturbed):
     told, looks = [], []
 
-    def look(scene):
-        looks.append((told[-1].step, scene.num_gaussians > 0))
+    class EveryTenth:
+        def is_due(self, share_of_steps):
+            return round(10 * share_of_steps, 9).is_integer()
 
-    found = fit_gaussians(world.observations, short_fit(), progress=told.append, first_look=look)
-    assert looks == [(STEPS // 10, True)]
+        def show(self, scene):
+            looks.append((told[-1].step, scene.num_gaussians > 0))
+
+    found = fit_gaussians(
+        world.observations, short_fit(), progress=told.append, onlooker=EveryTenth()
+    )
+    assert looks == [(tenth * STEPS // 10, True) for tenth in range(1, 11)]
     assert told[0].step == told[0].share == 0.0
     assert {now.plan for now in told} == {found.plan}
     assert found.plan.numbers()["most_gaussians"] == 900
