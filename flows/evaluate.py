@@ -9,8 +9,20 @@ from flows.overrides import with_changes
 from flows.parameters import ViewParameters, view_parameters
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, fitted_on, flicker_by_image
-from tasks.evaluation.views import evaluate, evaluate_flicker, evaluate_strips, load_scores
+from lidarpainter_models.evaluation.score_tables import (
+    FLICKER,
+    NEURAD,
+    Scores,
+    fitted_on,
+    flicker_by_image,
+)
+from tasks.evaluation.views import (
+    evaluate,
+    evaluate_by_neurad,
+    evaluate_flicker,
+    evaluate_strips,
+    load_scores,
+)
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, open_run
 from tasks.specs import FittedRef
@@ -27,7 +39,7 @@ class EvaluationRequest:
     run: str
     """A run id, a unique prefix of one, or `latest`."""
     protocol: str
-    """`paper`, `truth`, `cross-camera` or `flicker`."""
+    """`paper`, `truth`, `neurad`, `cross-camera` or `flicker`."""
     is_painted: bool = False
     """Judge what is painted at view time as well."""
     painter: str | None = None
@@ -86,7 +98,8 @@ def _variants(
         judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged[VIEW_TIME] = finished.final
-    judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate
+    judges = {CROSS_CAMERA: evaluate_strips, NEURAD: evaluate_by_neurad}
+    judge = judges.get(request.protocol, evaluate)
     run = parameters.run_spec(store.address, painter=request.painter)
     scores = {}
     for name, fitted in judged.items():

@@ -21,15 +21,18 @@ STRIP_FIGURES = {
     "uncalibrated_psnr": "seen by both, as delivered",
     "whole_image_psnr": "all, as delivered",
 }
-PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
+NEURAD = "neurad"
+PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, FLICKER)
 WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
 
 WORDS = """
 protocol: How the run is scored: paper (held-out views, and views beside the path where they are
-  known), truth (views beside the path of a synthetic street, against exact images), cross-camera
-  (cameras that no fit saw), or flicker (neighbouring frames against each other).
+  known), truth (views beside the path of a synthetic street, against exact images), neurad (every
+  held-out image at its recorded pose, for runs with --split linspace: the protocol of
+  neurad-studio), cross-camera (cameras that no fit saw), or flicker (neighbouring frames against
+  each other).
 postpaint: Also score what is painted at view time.
 painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the run's own
   if absent. Scores of another one are printed, but not entered into the catalog.

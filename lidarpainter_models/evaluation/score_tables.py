@@ -6,6 +6,8 @@ from typing import Any, Literal
 DEPTH = "depth_within_5_percent"
 FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
+NEURAD = "neurad"
+"""Entry of an evaluation by the protocol of neurad-studio, by camera."""
 ENVELOPE = "envelope"
 """Entry of the scores of a run: how far beside the path the scene can be trusted."""
 HELD_OUT = "held_out"
@@ -27,8 +29,14 @@ def metric_values(
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
     Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
-    have shifted paths alone.
+    have shifted paths alone, those by the protocol of neurad-studio cameras.
     """
+    if NEURAD in scores:
+        return [
+            (NEURAD, camera, name, value, values.get(f"{name}_reason"))
+            for camera, values in scores[NEURAD].items()
+            for name, value in _numbers(values)
+        ]
     if FLICKER in scores:
         return [
             ("flicker", trajectory, name, value, None)

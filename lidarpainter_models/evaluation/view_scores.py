@@ -41,12 +41,13 @@ class ScoredView:
     name: str
     camera: Camera
     timestamp_ns: int
-    truth_rgb: Float[Tensor, "height width 3"]
+    truth_rgb: Float[Tensor, "judged_rows width 3"]
+    """The rows that are judged, from the top: all of them, unless a protocol cuts some off."""
     actor_ids: tuple[str, ...]
     """The moving actors that are there."""
-    actor_index: Int[Tensor, "height width"]
+    actor_index: Int[Tensor, "judged_rows width"]
     """Whose projected box is in front, by position in `actor_ids`, or `NOBODY`."""
-    hidden: Bool[Tensor, "height width"] | None = None
+    hidden: Bool[Tensor, "judged_rows width"] | None = None
     """Where the truth shows the recording car itself: not judged."""
 
 
@@ -147,7 +148,7 @@ class _Scored(NamedTuple):
 
 
 def _one_scored(render: Renderer, view: ScoredView, *, distances: PerceptualDistances) -> _Scored:
-    image = render(view.camera, view.timestamp_ns).clamp(0, 1)
+    image = render(view.camera, view.timestamp_ns).clamp(0, 1)[: len(view.truth_rgb)]
     truth = view.truth_rgb.to(image.device)
     is_actor = (view.actor_index != NOBODY).to(image.device)
     hidden = None if view.hidden is None else view.hidden.to(image.device)

@@ -14,11 +14,14 @@ from catalog.store import Store
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.flicker import FlickerEvaluation
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.neurad_protocol import SPLIT, neurad_scores
 from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation
-from lidarpainter_models.evaluation.score_tables import FLICKER, Scores
+from lidarpainter_models.evaluation.score_tables import FLICKER, NEURAD, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.evaluation.strips import StripEvaluation
+from lidarpainter_models.metrics.perceptual import load_distances
 from tasks.evaluation.shown import painted_by, shown_by
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
@@ -52,6 +55,43 @@ def evaluate(
         build=partial(
             _build,
             evaluation=SceneEvaluation(held_out=this.held_out(config.observation), config=config),
+            shown=shown_by(this, fitted, config, view_time=view_time),
+        ),
+    )
+
+
+@stage_task
+def evaluate_by_neurad(
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    *,
+    view_time: bool = False,
+) -> StageResult:
+    """Score every held-out image by the protocol of neurad-studio.
+
+    Raises:
+        ConfigError: the run was not fitted to the split of that protocol.
+    """
+    if run.split.spec != SPLIT:
+        raise ConfigError(
+            f"--protocol {NEURAD} judges runs that were fitted with --split {SPLIT}, this one was "
+            f"with --split {run.split.spec}"
+        )
+    this = opened(run)
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind="evaluation",
+        inputs=evaluation_inputs(this, fitted, view_time=view_time)
+        | file_digests(config.weight_files),
+        config=_settings(run, config),
+        build=partial(
+            _build_neurad,
+            held_out=this.held_out(config.observation),
+            config=config,
             shown=shown_by(this, fitted, config, view_time=view_time),
         ),
     )
@@ -163,6 +203,21 @@ def _build(
     scores = evaluation.scores(shown(), progress)
     write_json(place.output / SCORES_FILE, scores)
     return {"psnr": scores["recorded"]["psnr"], "num_views": scores["recorded"]["num_views"]}
+
+
+def _build_neurad(
+    place: Workplace,
+    progress: Progress,
+    *,
+    held_out: HeldOut,
+    config: EvaluationConfig,
+    shown: Callable[[], ShownScene],
+) -> dict[str, Any]:
+    scene = shown()
+    distances = load_distances(config.feature_weights, config.lpips, scene.scene.device)
+    scores = neurad_scores(held_out, scene, distances, progress)
+    write_json(place.output / SCORES_FILE, scores)
+    return {name: scores[NEURAD]["all"][name] for name in ("psnr", "num_views")}
 
 
 def _build_strips(
