@@ -32,7 +32,7 @@ from lidarpainter_models.synthetic.street import SyntheticStreet
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
 NO_IMAGES = "nobody took images there"
-NO_INCEPTION = "Inception weights are user-supplied and none were given"
+NO_INCEPTION = "this version has no Inception network and computes neither FID nor KID"
 Scored = Callable[[Sequence[ScoredView]], ViewScores | None]
 """Renders views as the judged scene is shown and scores them."""
 
