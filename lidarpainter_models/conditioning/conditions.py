@@ -8,6 +8,7 @@ named whose exposure all of them then take.
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter
@@ -74,6 +75,16 @@ class ConditionBuilder:
         self._cameras = {view.key: scene.refined_camera(view) for view in training_views}
         self._sources: OrderedDict[ViewKey, Future[SourceImage]] = OrderedDict()
         self._of_sources = Lock()
+
+    def showing(self, scene: GaussianScene, boxes: MovingBoxes) -> "ConditionBuilder":
+        """The same knowledge of a scene whose actors stand elsewhere at the time of a view.
+
+        What was recorded is still drawn with the actors where they were.
+        """
+        other = copy(self)
+        other.scene, other.boxes = scene, boxes
+        other._new_source = self._new_source  # type: ignore[method-assign]
+        return other
 
     def forget_sources(self) -> None:
         """Free what was kept of training views; what is asked for again is rendered again."""

@@ -13,6 +13,7 @@ from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.collisions import Collision
@@ -91,10 +92,9 @@ class FollowedPath:
 
     @cached_property
     def _cameras(self) -> tuple[Camera, ...]:
-        return self._moving.moved(
-            self.views,
-            [self._found(view, fit_camera(view, self.observation)) for view in self.views],
-        )
+        cameras = [fit_camera(view, self.observation) for view in self.views]
+        found = map(self._found, self.views, cameras)
+        return self._moving.moved(self.views, list(found))
 
     def shown(self, camera: Camera, view: RecordedView) -> ShownMoment:
         """What is seen there, and what is known beside it."""
@@ -110,23 +110,26 @@ class FollowedPath:
         return ShownMoment(rgb=seen.rgb.clamp(0, 1), unpainted_rgb=None, depth_m=seen.depth_m)
 
     def _found(self, view: RecordedView, camera: Camera) -> Camera:
-        """Where the fit found a camera; one that it did not see rides on the rig of one it saw."""
-        scene = self.builder.scene
-        fitted = scene.cameras.camera_names
-        if view.camera_name in fitted or not fitted:
-            return scene.refined_camera(view, camera)
-        other = self._fitted_views.get(view.frame_index)
-        if other is None:
-            return camera
-        return scene.cameras.riding(
-            camera, view.timestamp_ns, other.camera, other.key, other.timestamp_ns
-        )
+        return found_camera(self.builder.scene, self.recorded, view, camera)
 
-    @cached_property
-    def _fitted_views(self) -> dict[int, RecordedView]:
-        """The views of the first camera that the fit saw, by frame."""
-        first = self.builder.scene.cameras.camera_names[0]
-        return {view.frame_index: view for view in self.recorded.views_of(first)}
+
+def found_camera(
+    scene: GaussianScene, recorded: DrivingScene, view: RecordedView, camera: Camera
+) -> Camera:
+    """Where the fit found a camera; one that it did not see rides on the rig of one it saw.
+
+    `camera` is the view's at the size that is wanted.
+    """
+    fitted = scene.cameras.camera_names
+    if view.camera_name in fitted or not fitted:
+        return scene.refined_camera(view, camera)
+    views = recorded.views_of(fitted[0])
+    other = next((one for one in views if one.frame_index == view.frame_index), None)
+    if other is None:
+        return camera
+    return scene.cameras.riding(
+        camera, view.timestamp_ns, other.camera, other.key, other.timestamp_ns
+    )
 
 
 def followed_cameras(

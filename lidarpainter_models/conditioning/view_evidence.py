@@ -9,6 +9,7 @@ World: x forward, y left, z up; metres.
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import fmean
@@ -74,6 +75,15 @@ class EvidenceGatherer:
         """Carries what is known into views, at their small size."""
         small = [_small_view(view) for view in self._views]
         return ConditionBuilder(self.scene, self._lidar_map, small, config=GATHERED)
+
+    def showing(self, scene: GaussianScene) -> "EvidenceGatherer":
+        """Measures what speaks for views of the scene with its actors elsewhere.
+
+        Recorded images show them where they were, and so speak against what shows them elsewhere.
+        """
+        other = copy(self)
+        other.builder = self.builder.showing(scene, self.builder.boxes)
+        return other
 
     @property
     def camera_names(self) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ World: x forward, y left, z up; box frame: x along the length, origin at the cen
 """
 
 from collections.abc import Sequence
+from copy import copy
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,6 +31,17 @@ class MovingBoxes:
         self.tracks = tuple(tracks)
         self._poses = TrackPoses.of(tracks)
         self._size_m = torch.stack([torch.zeros(3), *(track.size_m for track in tracks)])[1:]
+
+    def standing(
+        self,
+        timestamp_ns: int,
+        world_from_box: Float[Tensor, "actors 4 4"],
+        is_there: Bool[Tensor, " actors"],
+    ) -> "MovingBoxes":
+        """The same boxes, which at one time stand elsewhere, or are not there."""
+        other = copy(self)
+        other._poses = self._poses.standing(timestamp_ns, world_from_box, is_there)
+        return other
 
     def placed(self, timestamp_ns: int) -> list[tuple[ActorTrack, Float[Tensor, "4 4"]]]:
         """The actors that are there at a time, each with its `world_from_box` (float64)."""

@@ -4,7 +4,7 @@ Box frame: x along the length, y to the left, z up, origin at the centre.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -71,6 +71,10 @@ class TrackPoses:
         default_factory=dict, init=False, repr=False
     )
     """What was asked for: every view asks for the times of all its sources."""
+    _present_at: dict[int, Bool[Tensor, " tracks"]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    """Who is there at times at which it is said."""
 
     @classmethod
     def of(cls, tracks: Sequence[ActorTrack]) -> "TrackPoses":
@@ -92,6 +96,18 @@ class TrackPoses:
     def __len__(self) -> int:
         return self.timestamps_ns.shape[0]
 
+    def standing(
+        self,
+        timestamp_ns: int,
+        world_from_box: Float[Tensor, "tracks 4 4"],
+        is_there: Bool[Tensor, " tracks"],
+    ) -> "TrackPoses":
+        """The same tracks, which at one time stand elsewhere, or are not there."""
+        other = replace(self)
+        other._at[timestamp_ns] = world_from_box
+        other._present_at[timestamp_ns] = is_there
+        return other
+
     def present(
         self, timestamp_ns: int | Tensor, margin_ns: int = PRESENCE_MARGIN_NS
     ) -> Bool[Tensor, " *tracks"]:
@@ -100,6 +116,8 @@ class TrackPoses:
         An actor is there from a box to the next, unless frames without one lie between them for
         longer than a second, and for a margin before and after a box.
         """
+        if self._present_at and isinstance(timestamp_ns, int) and timestamp_ns in self._present_at:
+            return self._present_at[timestamp_ns]
         first_ns, last_ns = self.timestamps_ns[:, 0], self.timestamps_ns[:, -1]
         there = (first_ns - margin_ns <= timestamp_ns) & (timestamp_ns <= last_ns + margin_ns)
         if bool(self.is_bridged.all()):

@@ -88,7 +88,11 @@ class GaussianScene:
         Raises:
             ShapeError: Gaussians belong to bodies that the scene does not have.
         """
-        posed = self.posed(camera, camera.taken_ns(timestamp_ns))
+        return self.drawable_of(self.posed(camera, camera.taken_ns(timestamp_ns)))
+
+    @torch.no_grad()
+    def drawable_of(self, posed: PosedScene) -> DrawableScene:
+        """What the image of this scene is made of, its bodies posed in whichever way."""
         styled, strengths = self._styled_at(posed.taken_ns)
         if styled is not None:
             return styled.drawable(posed, strengths, self.exposure)
@@ -186,6 +190,15 @@ class GaussianScene:
             sky=self.sky.to(device),
             style=None if self.style is None else self.style.to(device),
         )
+
+    def with_actors(self, actors: Actors) -> "GaussianScene":
+        """The same scene whose actors, the same ones, stand elsewhere.
+
+        What was found out about Gaussians in their bodies is kept: no pose changes it.
+        """
+        other = replace(self, actors=actors)
+        other.__dict__.update(_blocks=self._blocks, _styled=self._styled)
+        return other
 
     def baked(
         self, timestamp_ns: int, eye_world: Float[Tensor, "3"] | None = None

@@ -47,7 +47,7 @@ def as_read(
         gaussians.rotation_wxyz,
         gaussians.body_index,
         bodies[:, :3],
-        _body_rates(camera, shutter, actors, timestamp_ns),
+        body_rates(camera, shutter, actors, timestamp_ns),
         camera,
     )
     return replace(
@@ -68,8 +68,14 @@ def bodies_while_read(
     if shutter is None or not shutter.is_rolling:
         return []
     half_s = sum(map(abs, shutter.across_s)) / 2
-    rates = _body_rates(camera, shutter, actors, timestamp_ns).to(bodies)
-    way = torch.nn.functional.pad(half_s * rates, (0, 0, 0, 1))
+    return bodies_apart(bodies, body_rates(camera, shutter, actors, timestamp_ns), half_s)
+
+
+def bodies_apart(
+    bodies: Float[Tensor, "bodies 4 4"], rates: Float[Tensor, "bodies 3 4"], half_s: float
+) -> list[Float[Tensor, "bodies 4 4"]]:
+    """Where bodies stand before the camera so long before and so long after, by `body_rates`."""
+    way = torch.nn.functional.pad(half_s * rates.to(bodies), (0, 0, 0, 1))
     return [bodies - bodies @ way, bodies + bodies @ way]
 
 
@@ -81,7 +87,7 @@ def _bodies_after(
     return camera_from_body(camera.world_from_camera.double() @ moved, *poses)
 
 
-def _body_rates(
+def body_rates(
     camera: Camera, shutter: Shutter, actors: Actors, timestamp_ns: int
 ) -> Float[Tensor, "bodies 3 4"]:
     """By how much a body's points move before the camera in a second, in the body's own frame.

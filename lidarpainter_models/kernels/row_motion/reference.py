@@ -1,5 +1,8 @@
 """Motion until a pixel is read in plain torch: the law for the fast version, on any device."""
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -8,8 +11,10 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.row_motion import MOST_GROWTH, NEAR_M, ROUNDS
 
+ReadingTimes = Callable[[Tensor], Tensor]
+"""When points of the camera's frame (points, 3) are read: seconds after the middle of the image."""
 
-@torch.no_grad()
+
 def motion_until_read(
     means: Float[Tensor, "gaussians 3"],
     rotation_wxyz: Float[Tensor, "gaussians 4"],
@@ -19,12 +24,29 @@ def motion_until_read(
     camera: Camera,
 ) -> tuple[Float[Tensor, "gaussians 3"], Float[Tensor, "gaussians 3"]]:
     """See `row_motion.motion_until_read`."""
+    read_s = partial(_read_s, camera=camera)
+    return motion_by_times(
+        means, rotation_wxyz, body_index, camera_from_body, metres_per_s, read_s=read_s
+    )
+
+
+@torch.no_grad()
+def motion_by_times(
+    means: Float[Tensor, "gaussians 3"],
+    rotation_wxyz: Float[Tensor, "gaussians 4"],
+    body_index: Int[Tensor, " gaussians"],
+    camera_from_body: Float[Tensor, "bodies 3 4"],
+    metres_per_s: Float[Tensor, "bodies 3 4"],
+    *,
+    read_s: ReadingTimes,
+) -> tuple[Float[Tensor, "gaussians 3"], Float[Tensor, "gaussians 3"]]:
+    """The same for any lens, by when it reads what it sees; `read_s` is differentiable."""
     pose = camera_from_body[body_index.long()]
     velocity = _moved(metres_per_s[body_index.long()], means)
     read = means
     for _ in range(ROUNDS):
-        read = means + _read_s(_moved(pose, read), camera)[:, None] * velocity
-    later_per_m = _slope(_moved(pose, read), camera)
+        read = means + read_s(_moved(pose, read))[:, None] * velocity
+    later_per_m = _slope(_moved(pose, read), read_s)
     axes = rotation_from_quaternion(rotation_wxyz)
     along = (later_per_m[:, None] @ pose[..., :3] @ axes)[:, 0]
     growth = 1 + along * (velocity[:, None] @ axes)[:, 0]
@@ -44,9 +66,9 @@ def _read_s(seen: Float[Tensor, "*points 3"], camera: Camera) -> Float[Tensor, "
     return camera.read_s(seen[..., :2] / seen[..., 2:].clamp(min=NEAR_M) * focal + centre)
 
 
-def _slope(seen: Float[Tensor, "points 3"], camera: Camera) -> Float[Tensor, "points 3"]:
+def _slope(seen: Float[Tensor, "points 3"], read_s: ReadingTimes) -> Float[Tensor, "points 3"]:
     """How much later a point is read per metre that it moves in the camera's frame (s/m)."""
     with torch.enable_grad():
         place = seen.detach().requires_grad_(True)
-        (slope,) = torch.autograd.grad(_read_s(place, camera).sum(), place)
+        (slope,) = torch.autograd.grad(read_s(place).sum(), place)
     return slope

@@ -1,0 +1,238 @@
+"""Images of any lens, resampled from pinhole images that are finer than it.
+
+A pinhole image shows exactly what lies in the direction of each of its points, so a distorted image
+is exact where it is sampled along the rays of its own pixels. A lens narrower than `ONE_FACE_RAD`
+takes one pinhole image along its axis; a wider one those faces of a cube around it that its rays
+meet, each cut to the part they meet. Where a shutter rolls, Gaussians are moved to when the
+distorted image reads them, before any face is drawn.
+
+Camera frames: x right, y down, z forward.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.rolling_shutter import bodies_apart
+from lidarpainter_models.gaussians.model.scene_rendering import PosedScene, gaussians_at
+from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
+from lidarpainter_models.gaussians.model.spatial_blocks import View
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.row_motion.reference import ReadingTimes, motion_by_times
+from lidarpainter_models.serving.sensor_cameras import SensorCamera
+
+ONE_FACE_RAD = math.radians(55)
+"""Half of 110 degrees: beyond it one pinhole image has too many pixels at its rim."""
+DENSITY = 1.25
+"""Pixels of a face per pixel of the lens where the lens is finest, along one axis."""
+MOST_PIXELS = 4.0
+"""Pixels of all faces together per pixel of the image; beyond it faces are coarser."""
+MARGIN_PX = 4
+"""Around what rays meet of a face: resampling looks at neighbours."""
+_CUBE = {
+    (2, 1): ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # ahead
+    (0, 1): ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),  # right
+    (0, -1): ((0, 0, -1), (0, 1, 0), (1, 0, 0)),  # left
+    (1, 1): ((1, 0, 0), (0, 0, 1), (0, -1, 0)),  # down
+    (1, -1): ((1, 0, 0), (0, 0, -1), (0, 1, 0)),  # up
+    (2, -1): ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),  # behind
+}
+"""By axis of the lens and sign: its rotation `lens_from_face`, row by row."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Face:
+    """A pinhole image, and which pixels of the lens are sampled from it."""
+
+    name: str
+    """Among the faces of its lens."""
+    camera_from_face: Float[Tensor, "4 4"]
+    pinhole: Camera
+    """At the origin of the lens, in its frame."""
+    rows: slice
+    columns: slice
+    """The part of the image that it has pixels in."""
+    is_own: np.ndarray
+    """Which pixels of that part are its own."""
+    places: tuple[np.ndarray, np.ndarray]
+    """Where in the face the pixels of the part are sampled, as OpenCV counts pixels."""
+
+    def at(self, world_from_camera: Float[Tensor, "4 4"]) -> Camera:
+        """The face as a camera of the world."""
+        return self.pinhole.at(world_from_camera @ self.camera_from_face)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LensImage:
+    """How the image of one lens is put together; the same for every pose."""
+
+    camera: SensorCamera
+    faces: tuple[Face, ...]
+    is_seen: Bool[Tensor, "height width"]
+    """Pixels that the lens has a ray for; others are black."""
+    rays: Float[Tensor, "height width 3"]
+    """float32, of unit length."""
+
+    @classmethod
+    def of(cls, camera: SensorCamera) -> "LensImage":
+        """Find the rays of a lens and the faces that they meet."""
+        rays, is_seen = camera.pixel_rays()
+        seen = rays[is_seen]
+        one_face = bool((seen[:, 2] > math.cos(ONE_FACE_RAD)).all())
+        largest = torch.zeros_like(is_seen, dtype=torch.int64)
+        if one_face:
+            largest += 2
+        else:
+            largest = rays.abs().argmax(dim=-1)
+        sign = torch.gather(rays, -1, largest[..., None])[..., 0].sign()
+        focal_px = _density(rays, is_seen) * DENSITY
+        wanted = [
+            (turn, is_seen & (largest == axis) & (sign == side))
+            for (axis, side), turn in _CUBE.items()
+        ]
+        areas = [_area(turn, rays, own) for turn, own in wanted if bool(own.any())]
+        most = MOST_PIXELS * is_seen.numel()
+        focal_px *= min(1.0, math.sqrt(most / max(sum(areas) * focal_px**2, 1e-9)))
+        faces = [
+            _face(str(number), turn, rays, own, focal_px)
+            for number, (turn, own) in enumerate(wanted)
+            if bool(own.any())
+        ]
+        return cls(camera=camera, faces=tuple(faces), is_seen=is_seen, rays=rays.float())
+
+    def drawn(
+        self, draw: Callable[[Face], Float[Tensor, "face_height face_width 3"]]
+    ) -> Float[Tensor, "height width 3"]:
+        """The image, by what a function draws of each face; black where the lens sees nothing."""
+        image = np.zeros((*self.is_seen.shape, 3), np.float32)
+        for face in self.faces:
+            drawn = draw(face).cpu().numpy()
+            sampled = cv2.remap(
+                drawn, *face.places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            )
+            image[face.rows, face.columns][face.is_own] = sampled[face.is_own]
+        return torch.from_numpy(image)
+
+    def meeting(
+        self, mask: Bool[Tensor, "mask_height mask_width"], pinhole: Camera
+    ) -> Bool[Tensor, "height width"]:
+        """The pixels whose rays fall into a mask of a pinhole that stands where the lens does."""
+        high, wide = mask.shape
+        ahead = self.rays[..., 2].clamp(min=1e-6)
+        column = (self.rays[..., 0] / ahead * pinhole.fx_px + pinhole.cx_px).floor().long()
+        row = (self.rays[..., 1] / ahead * pinhole.fy_px + pinhole.cy_px).floor().long()
+        inside = (self.rays[..., 2] > 0) & (column >= 0) & (row >= 0)
+        inside &= (column < wide) & (row < high)
+        return inside & mask[row.clamp(0, high - 1), column.clamp(0, wide - 1)]
+
+
+def _tangents(turn: tuple[tuple[int, ...], ...], rays: Tensor, own: Tensor) -> Tensor:
+    """Where the rays of some pixels meet a face one unit ahead."""
+    seen = rays[own] @ rays.new_tensor(turn)
+    return seen[:, :2] / seen[:, 2:]
+
+
+def _area(turn: tuple[tuple[int, ...], ...], rays: Tensor, own: Tensor) -> float:
+    """Of what rays meet of a face one unit ahead."""
+    met = _tangents(turn, rays, own)
+    return float((met.amax(0) - met.amin(0)).prod())
+
+
+def _density(rays: Float[Tensor, "height width 3"], is_seen: Bool[Tensor, "height width"]) -> float:
+    """Pixels per radian where the lens is finest, but for a hundredth of its pixels."""
+    steps = []
+    for axis in (0, 1):
+        both = is_seen.narrow(axis, 1, is_seen.shape[axis] - 1)
+        both = both & is_seen.narrow(axis, 0, is_seen.shape[axis] - 1)
+        steps.append(rays.diff(dim=axis).norm(dim=-1)[both])
+    found = torch.cat(steps)
+    if not len(found):
+        return 1.0
+    return float(1 / found.kthvalue(1 + len(found) // 100).values.clamp(min=1e-6))
+
+
+def _face(
+    name: str,
+    turn: tuple[tuple[int, ...], ...],
+    rays: Float[Tensor, "height width 3"],
+    own: Bool[Tensor, "height width"],
+    focal_px: float,
+) -> Face:
+    met = _tangents(turn, rays, own) * focal_px
+    low = (met.amin(0).floor() - MARGIN_PX).tolist()
+    high = (met.amax(0).ceil() + MARGIN_PX).tolist()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor(turn, dtype=torch.float64)
+    pinhole = Camera(
+        world_from_camera=pose,
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=-low[0],
+        cy_px=-low[1],
+        width_px=round(high[0] - low[0]),
+        height_px=round(high[1] - low[1]),
+    )
+    rows, columns = (_reach(own.any(dim=axis)) for axis in (1, 0))
+    part = own[rows, columns]
+    places = torch.zeros(*part.shape, 2, dtype=torch.float32)
+    places[part] = (met - met.new_tensor(low) - 0.5).float()
+    return Face(
+        name=name,
+        camera_from_face=pose,
+        pinhole=pinhole,
+        rows=rows,
+        columns=columns,
+        is_own=part.numpy(),
+        places=(places[..., 0].contiguous().numpy(), places[..., 1].contiguous().numpy()),
+    )
+
+
+def _reach(is_there: Bool[Tensor, " places"]) -> slice:
+    found = is_there.nonzero()[:, 0]
+    return slice(int(found[0]), int(found[-1]) + 1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReadByLens(PosedScene):
+    """A scene before a face of a lens whose shutter rolls over the lens' own image."""
+
+    rates: Float[Tensor, "bodies 3 4"]
+    """How bodies move before the lens; see `rolling_shutter.body_rates`."""
+    readout_s: float
+    read_s: ReadingTimes
+    """When points of the face's frame are read."""
+
+    def looks(self) -> list[View]:
+        """The face in the middle of the readout, at its beginning and at its end."""
+        moments = bodies_apart(self.bodies, self.rates, self.readout_s / 2)
+        return [(self.camera, bodies) for bodies in (self.bodies, *moments)]
+
+    def shown(self, gaussians: AnyGaussians) -> AnyGaussians:
+        """Gaussians of the scene as the lens reads them, in the frames of their bodies."""
+        then = gaussians_at(gaussians, self.actors, self.blinking, self.taken_ns)
+        poses, rates = (each[:, :3].to(then.means) for each in (self.bodies, self.rates))
+        offset_m, log_growth = motion_by_times(
+            then.means, then.rotation_wxyz, then.body_index, poses, rates, read_s=self.read_s
+        )
+        return replace(then, means=then.means + offset_m, log_scale=then.log_scale + log_growth)
+
+
+def reading_times(
+    camera: SensorCamera,
+    across_s: tuple[float, float],
+    camera_from_face: Float[Tensor, "4 4"],
+) -> ReadingTimes:
+    """When a lens reads points of a face's frame: by the place of each in the distorted image."""
+
+    def read_s(points: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
+        uv = camera.project(points @ camera_from_face[:3, :3].to(points).T)
+        size = uv.new_tensor([camera.width_px, camera.height_px])
+        return (uv / size - 0.5).clamp(-0.5, 0.5) @ uv.new_tensor(across_s)
+
+    return read_s

@@ -1,0 +1,220 @@
+"""What requests ask for, checked, and poses and lenses as messages.
+
+Everything here comes from outside: sizes, numbers and lists are bounded before they are used, and
+what makes no sense is refused in one line that names the field.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import (
+    interpolate_rigid,
+    quaternion_from_rotation,
+    rigid_from_rotation,
+    rotation_from_quaternion,
+)
+from lidarpainter_models.serving.image_formats import Encoding, encoding_of
+from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.refusals import invalid
+from lidarpainter_models.serving.requested_lenses import checked_size, sensor_camera
+from lidarpainter_models.serving.sensor_cameras import SensorCamera
+
+MOST_ACTORS = 4096
+"""Of one request."""
+FARTHEST_M = 1e6
+"""From the origin of the scene; float32 has centimetres there."""
+LENGTH_TOLERANCE = 0.01
+"""By which a quaternion may depart from unit length."""
+LONGEST_S = 1.0
+"""Of a readout."""
+_ACROSS = {
+    sensorsim_pb2.UNKNOWN: (0.0, 0.0),
+    sensorsim_pb2.GLOBAL: (0.0, 0.0),
+    sensorsim_pb2.ROLLING_TOP_TO_BOTTOM: (0.0, 1.0),
+    sensorsim_pb2.ROLLING_BOTTOM_TO_TOP: (0.0, -1.0),
+    sensorsim_pb2.ROLLING_LEFT_TO_RIGHT: (1.0, 0.0),
+    sensorsim_pb2.ROLLING_RIGHT_TO_LEFT: (-1.0, 0.0),
+}
+"""By shutter: how much later the right end and the lower end are read, in readouts."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorRequest:
+    """One image that is asked for."""
+
+    scene_id: str
+    camera_name: str
+    """Whose exposure and own body it gets; may be a name that the scene does not know."""
+    camera: SensorCamera
+    """At the size that is asked for."""
+    start_us: int
+    end_us: int
+    """When the shutter opens and closes."""
+    across: tuple[float, float] = (0.0, 0.0)
+    """How much later the right end and the lower end are read, in readouts: 0, 1 or -1."""
+    world_from_sensor: Float[Tensor, "2 4 4"]
+    """At the start and at the end."""
+    actor_ids: tuple[str, ...] = ()
+    """Who is there; nobody else is."""
+    world_from_actors: Float[Tensor, "actors 2 4 4"]
+    """Their boxes at the start and at the end."""
+    own_body_of: str | None = None
+    """Camera whose view of the recording car is laid over the image."""
+    encoding: Encoding
+
+    @property
+    def middle_ns(self) -> int:
+        """When the middle of the image is read; an instant [t, t + 1) us is t."""
+        is_instant = self.end_us - self.start_us <= 1
+        return self.start_us * 1000 if is_instant else (self.start_us + self.end_us) * 500
+
+    @property
+    def readout_s(self) -> float:
+        """How long the shutter rolls; 0 where it does not."""
+        return (self.end_us - self.start_us) * 1e-6 if any(self.across) else 0.0
+
+    @property
+    def across_s(self) -> tuple[float, float]:
+        """How much later the right end and the lower end of the image are read."""
+        return self.across[0] * self.readout_s, self.across[1] * self.readout_s
+
+    @property
+    def world_from_middle(self) -> Float[Tensor, "4 4"]:
+        """Where the sensor is in the middle of the readout."""
+        return middle_of(self.world_from_sensor[None])[0]
+
+
+def middle_of(pairs: Float[Tensor, "bodies 2 4 4"]) -> Float[Tensor, "bodies 4 4"]:
+    """Poses half way from the start to the end; exactly those where nothing moves."""
+    start, end = pairs.unbind(1)
+    half = interpolate_rigid(start, end, torch.full(pairs.shape[:1], 0.5, dtype=pairs.dtype))
+    stands = (start == end).all(-1).all(-1)
+    return torch.where(stands[:, None, None], start, half)
+
+
+def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRequest
+    """What an `RGBRenderRequest` asks for.
+
+    Raises:
+        RequestError: INVALID_ARGUMENT, with the field that makes no sense.
+    """
+    spec = message.camera_intrinsics
+    width_px, height_px = checked_size(message, spec)
+    start_us, end_us = message.frame_start_us, message.frame_end_us
+    if end_us < start_us:
+        raise invalid(f"frame_end_us {end_us} lies before frame_start_us {start_us}")
+    if end_us - start_us > LONGEST_S * 1e6 or end_us >= 2**53:
+        raise invalid(
+            f"frame_start_us {start_us} to frame_end_us {end_us}: expected a shutter of at most "
+            f"{LONGEST_S:g} s"
+        )
+    if spec.shutter_type not in _ACROSS:
+        raise invalid(f"shutter_type {spec.shutter_type}: expected 0 to {len(_ACROSS) - 1}")
+    if len(message.dynamic_objects) > MOST_ACTORS:
+        raise invalid(
+            f"{len(message.dynamic_objects)} dynamic_objects: expected at most {MOST_ACTORS}"
+        )
+    ids = tuple(one.track_id for one in message.dynamic_objects)
+    pairs = [(f"dynamic object {one.track_id!r}", one.pose_pair) for one in message.dynamic_objects]
+    poses = _poses([("sensor_pose", message.sensor_pose), *pairs])
+    name = spec.logical_id
+    return SensorRequest(
+        scene_id=message.scene_id,
+        camera_name=name,
+        camera=sensor_camera(spec).resized(width_px, height_px),
+        start_us=start_us,
+        end_us=end_us,
+        across=_ACROSS[spec.shutter_type],
+        world_from_sensor=poses[0],
+        actor_ids=_each_once(ids),
+        world_from_actors=poses[1:],
+        own_body_of=_own_body_of(message),
+        encoding=encoding_of(message.image_format, message.image_quality),
+    )
+
+
+def _own_body_of(message: Any) -> str | None:  # noqa: ANN401  an RGBRenderRequest
+    if not message.insert_ego_mask:
+        return None
+    return message.ego_mask_id.camera_logical_id or message.camera_intrinsics.logical_id
+
+
+def _each_once(ids: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(ids)) < len(ids):
+        twice = next(name for index, name in enumerate(ids) if name in ids[:index])
+        raise invalid(f"dynamic object {twice!r} is there twice")
+    return ids
+
+
+def _poses(pairs: Sequence[tuple[str, Any]]) -> Float[Tensor, "pairs 2 4 4"]:
+    """Pairs of poses (`PosePair`); one without an end stays where it starts."""
+    rows = []
+    for what, pair in pairs:
+        if not pair.HasField("start_pose"):
+            raise invalid(f"{what} has no start_pose")
+        end = pair.end_pose if pair.HasField("end_pose") else pair.start_pose
+        rows.append([_numbers(pair.start_pose), _numbers(end)])
+    found = torch.tensor(rows, dtype=torch.float64)
+    lengths = found[..., 3:].norm(dim=-1)
+    is_good = found.isfinite().all(-1) & ((lengths - 1).abs() <= LENGTH_TOLERANCE)
+    is_good &= (found[..., :3].abs() <= FARTHEST_M).all(-1)
+    if not bool(is_good.all()):
+        row, end = (~is_good).nonzero()[0].tolist()
+        shown = ", ".join(f"{number:g}" for number in found[row, end].tolist())
+        raise invalid(
+            f"{pairs[row][0]} has a pose (x, y, z; w, x, y, z) of {shown}: expected metres within "
+            f"{FARTHEST_M:g} and a unit quaternion"
+        )
+    return rigid_from_rotation(rotation_from_quaternion(found[..., 3:]), found[..., :3])
+
+
+def _numbers(pose: Any) -> list[float]:  # noqa: ANN401  a Pose
+    vec, quat = pose.vec, pose.quat
+    return [vec.x, vec.y, vec.z, quat.w, quat.x, quat.y, quat.z]
+
+
+def pose_message(world_from_body: Float[Tensor, "4 4"]) -> Any:  # noqa: ANN401  a Pose
+    """A pose as a message; float32 there."""
+    x, y, z = world_from_body[:3, 3].tolist()
+    w, i, j, k = quaternion_from_rotation(world_from_body[:3, :3]).tolist()
+    return common_pb2.Pose(
+        vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w, x=i, y=j, z=k)
+    )
+
+
+def trajectory_message(
+    timestamps_ns: Sequence[int], world_from_body: Float[Tensor, "times 4 4"]
+) -> Any:  # noqa: ANN401  a Trajectory
+    """Poses at times as a message."""
+    return common_pb2.Trajectory(
+        poses=[
+            common_pb2.PoseAtTime(pose=pose_message(pose), timestamp_us=int(time_ns) // 1000)
+            for time_ns, pose in zip(timestamps_ns, world_from_body, strict=True)
+        ]
+    )
+
+
+def camera_message(name: str, camera: Camera) -> Any:  # noqa: ANN401  a CameraSpec
+    """The lens of a camera as a message."""
+    across_s = (0.0, 0.0) if camera.shutter is None else camera.shutter.across_s
+    across = tuple(math.copysign(1.0, each) if each else 0.0 for each in across_s)
+    shutter = next(kind for kind, one in _ACROSS.items() if one == across and kind)
+    return sensorsim_pb2.CameraSpec(
+        logical_id=name,
+        resolution_w=camera.width_px,
+        resolution_h=camera.height_px,
+        shutter_type=sensorsim_pb2.GLOBAL if not any(across) else shutter,
+        opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
+            principal_point_x=camera.cx_px,
+            principal_point_y=camera.cy_px,
+            focal_length_x=camera.fx_px,
+            focal_length_y=camera.fy_px,
+        ),
+    )

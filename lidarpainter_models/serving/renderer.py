@@ -1,0 +1,337 @@
+"""One fitted scene that answers requests: an image, and how far it can be trusted.
+
+A pinhole is drawn the ordinary way; other lenses are put together from pinholes (`lens_images`).
+What a request has as it was recorded, up to the rounding of its message, is drawn exactly as it was
+recorded: so a recorded pose gives the image of `render`, bit for bit.
+World: x forward, y left, z up, from where the recording began; metres.
+"""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.followed_paths import found_camera
+from lidarpainter_models.conditioning.view_evidence import EVIDENCE_WIDTH_PX, EvidenceGatherer
+from lidarpainter_models.evaluation.view_confidence import Calibration
+from lidarpainter_models.gaussians.model.actors import PRESENCE_MARGIN_NS
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
+from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
+from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
+from lidarpainter_models.serving.messages import SensorRequest
+from lidarpainter_models.serving.painted_streams import PaintedStreams
+from lidarpainter_models.serving.placed_actors import placed_actors, same_pose, twists_of
+from lidarpainter_models.serving.refusals import RequestError, invalid
+from lidarpainter_models.serving.sensor_cameras import SensorCamera
+from lidarpainter_models.serving.trust import EnvelopeDistance, Trust
+
+SAME_TIME_NS = 1_500
+"""Up to which a request is of a recorded moment: messages count in microseconds."""
+MOST_LENSES = 24
+"""Whose rays are kept: those of a rig or two."""
+MIDDLE_TANGENT = 1.4
+"""Of the part of a wide lens that its trust is measured on: 109 degrees across."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What a request is answered with."""
+
+    rgb_u8: UInt8[np.ndarray, "height width 3"]
+    trust: Trust
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moment:
+    """What a request shows: the scene with its actors in place, when, and from where."""
+
+    scene: GaussianScene
+    camera_name: str
+    taken_ns: int
+    timestamp_ns: int
+    """Of the image as recorded; not `taken_ns` where a camera's clock was found wrong."""
+    recorded: Camera | None
+    """The recorded camera, where the request is of one; None for all else."""
+    world_from_camera: Float[Tensor, "4 4"]
+    shutter: Shutter | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ServedScene:
+    """A fitted scene and all that is known of it; requests may come from several threads."""
+
+    scene_id: str
+    recorded: DrivingScene
+    builder: ConditionBuilder
+    """The fitted scene, and what is known of its views."""
+    observation: ObservationConfig
+    calibration: Calibration
+    envelope: Mapping[str, Any] | None = None
+    streams: PaintedStreams | None = None
+    """Paints images; None shows the scene as it is."""
+    _lenses: OrderedDict[SensorCamera, LensImage] = field(default_factory=OrderedDict, init=False)
+    _distances: dict[str, EnvelopeDistance] = field(default_factory=dict, init=False)
+    _lock: Lock = field(default_factory=Lock, init=False)
+
+    @property
+    def scene(self) -> GaussianScene:
+        """The fitted scene."""
+        return self.builder.scene
+
+    @cached_property
+    def time_range_us(self) -> tuple[int, int]:
+        """Times [first, last) that can be asked for: half a frame beyond what was recorded."""
+        times_ns = [view.timestamp_ns for view in self.recorded.views]
+        times_ns += self.recorded.frame_timestamps_ns.tolist()
+        first_ns, last_ns = min(times_ns) - PRESENCE_MARGIN_NS, max(times_ns) + PRESENCE_MARGIN_NS
+        return max(first_ns // 1000, 0), last_ns // 1000
+
+    @cached_property
+    def parked(self) -> dict[str, ActorTrack]:
+        """Recorded actors that are part of the street, by id."""
+        moving = {track.actor_id for track in self.scene.actors.recorded_tracks}
+        tracks = self.recorded.tracks
+        return {track.actor_id: track for track in tracks if track.actor_id not in moving}
+
+    @cached_property
+    def evidence(self) -> EvidenceGatherer | None:
+        """Measures what speaks for a view; None in a style, which has no true images."""
+        if self.scene.style is not None:
+            return None
+        builder = self.builder
+        return EvidenceGatherer(self.scene, builder.lidar_map, builder.training_views)
+
+    def frame(self, request: SensorRequest, client: str = "") -> Frame:
+        """The image that a request asks for.
+
+        Args:
+            request: what is asked for.
+            client: who asks; frames of one client and camera are painted in agreement.
+
+        Raises:
+            RequestError: OUT_OF_RANGE: the scene knows nothing of that time; INVALID_ARGUMENT: it
+                has no such actor or camera.
+        """
+        moment = self._moment(request)
+        painter = None
+        if self.streams is not None:
+            painter = self.streams.painter(moment, self.builder, client)
+        rgb = self._image(request, moment, painter)
+        if request.own_body_of is not None:
+            rgb = torch.where(self._own_body(request)[..., None], 0.0, rgb)
+        rgb_u8 = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        return Frame(rgb_u8=rgb_u8, trust=self.trust(request, moment))
+
+    def trust(self, request: SensorRequest, moment: Moment | None = None) -> Trust:
+        """How far the image of a request can be trusted, before anybody paints it."""
+        moment = self._moment(request) if moment is None else moment
+        distance_m = None
+        if self.envelope is not None:
+            distance_m = self._distance(request.camera_name).of(moment.world_from_camera)
+        if self.evidence is None:
+            return Trust(distance_m=distance_m)
+        evidence = self.evidence
+        if moment.scene is not self.scene:
+            evidence = evidence.showing(moment.scene)
+        camera = self._looked_at(request, moment)
+        found = self.calibration.of(evidence.of(camera, moment.timestamp_ns, moment.camera_name))
+        return Trust(
+            confidence=found.confidence, predicted_db=found.predicted_db, distance_m=distance_m
+        )
+
+    def found(self, view: RecordedView, camera: Camera | None = None) -> Camera:
+        """A recorded view's camera where the fit found it, at recorded size or another one."""
+        taken = view.camera if camera is None else camera
+        return found_camera(self.scene, self.recorded, view, taken)
+
+    def _moment(self, request: SensorRequest) -> Moment:
+        first_us, last_us = self.time_range_us
+        if request.start_us < first_us or request.end_us > last_us:
+            raise RequestError(
+                "OUT_OF_RANGE",
+                f"frame_start_us {request.start_us} to frame_end_us {request.end_us}: scene "
+                f"{self.scene_id} was recorded from {first_us} to {last_us} us",
+            )
+        middle, shutter = request.world_from_middle, None
+        if request.readout_s:
+            twist = twists_of(request.world_from_sensor[None], request.readout_s)[0]
+            shutter = Shutter(across_s=request.across_s, twist_per_s=twist)
+        taken_ns = timestamp_ns = request.middle_ns
+        found = self._recorded_as(request, middle)
+        if found is not None:
+            view, camera = found
+            timestamp_ns, taken_ns = view.timestamp_ns, camera.taken_ns(view.timestamp_ns)
+            middle, shutter = camera.world_from_camera, camera.shutter
+        own = self.scene.actors
+        actors = placed_actors(own, self.parked, request, taken_ns)
+        return Moment(
+            scene=self.scene if actors is own else self.scene.with_actors(actors),
+            camera_name=request.camera_name,
+            taken_ns=taken_ns,
+            timestamp_ns=timestamp_ns,
+            recorded=None if found is None else found[1],
+            world_from_camera=middle,
+            shutter=shutter,
+        )
+
+    def _recorded_as(
+        self, request: SensorRequest, middle: Float[Tensor, "4 4"]
+    ) -> tuple[RecordedView, Camera] | None:
+        """The recorded view that a request is of, and its camera at the size asked for."""
+        view = self._views.get(request.camera_name, {}).get(round(request.middle_ns / 1e6))
+        if view is None or abs(view.timestamp_ns - request.middle_ns) > SAME_TIME_NS:
+            return None
+        size = {"width_px": request.camera.width_px, "height_px": request.camera.height_px}
+        camera = self.found(view, view.camera.resized(**size))
+        if not bool(same_pose(middle, camera.world_from_camera.double())):
+            return None
+        return (view, camera) if _reads_alike(request, camera) else None
+
+    @cached_property
+    def _views(self) -> dict[str, dict[int, RecordedView]]:
+        """Recorded views by camera, and by time in milliseconds."""
+        return {
+            name: {round(view.timestamp_ns / 1e6): view for view in self.recorded.views_of(name)}
+            for name in self.recorded.camera_names
+        }
+
+    def _image(
+        self,
+        request: SensorRequest,
+        moment: Moment,
+        painter: Any,  # noqa: ANN401
+    ) -> Float[Tensor, "height width 3"]:
+        pinhole = request.camera.pinhole_at(moment.world_from_camera)
+        if pinhole is not None:
+            camera = replace(pinhole, shutter=moment.shutter)
+            if moment.recorded is not None and _same_lens(camera, moment.recorded):
+                camera = moment.recorded
+            if painter is not None:
+                return painter("", camera)
+            drawn = moment.scene.drawable(camera, moment.timestamp_ns)
+            return drawn.render(camera_name=moment.camera_name).rgb
+        lens = self.lens(request.camera)
+        if painter is not None:
+            return lens.drawn(lambda face: painter(face.name, face.at(moment.world_from_camera)))
+        return lens.drawn(self._faces(request.camera, moment))
+
+    def _faces(self, camera: SensorCamera, moment: Moment) -> Any:  # noqa: ANN401  a function
+        """What draws a face of a lens at a moment."""
+        scene, shutter = moment.scene, moment.shutter
+        poses = scene.actors.refined_poses(moment.taken_ns)
+        common = {
+            "taken_ns": moment.taken_ns,
+            "poses": poses,
+            "actors": scene.actors,
+            "blinking": scene.blinking,
+        }
+        rates = None
+        if shutter is not None:
+            standing = Camera.centred(moment.world_from_camera, 1.0, width_px=1, height_px=1)
+            rates = body_rates(standing, shutter, scene.actors, moment.taken_ns)
+
+        def draw(face: Face) -> Float[Tensor, "height width 3"]:
+            pinhole = face.at(moment.world_from_camera)
+            seen = {
+                "camera": pinhole,
+                "bodies": camera_from_body(pinhole.world_from_camera, *poses),
+            }
+            posed = PosedScene(**common, **seen)
+            if rates is not None and shutter is not None:
+                posed = ReadByLens(
+                    **common,
+                    **seen,
+                    rates=rates,
+                    readout_s=sum(map(abs, shutter.across_s)),
+                    read_s=reading_times(camera, shutter.across_s, face.camera_from_face),
+                )
+            return scene.drawable_of(posed).render(camera_name=moment.camera_name).rgb
+
+        return draw
+
+    def lens(self, camera: SensorCamera) -> LensImage:
+        """How the image of a lens is put together; found once."""
+        with self._lock:
+            if camera not in self._lenses:
+                self._lenses[camera] = LensImage.of(camera)
+                if len(self._lenses) > MOST_LENSES:
+                    self._lenses.popitem(last=False)
+            self._lenses.move_to_end(camera)
+            return self._lenses[camera]
+
+    def _looked_at(self, request: SensorRequest, moment: Moment) -> Camera:
+        """A pinhole that sees what an image shows, or the middle part of it."""
+        pinhole = request.camera.pinhole_at(moment.world_from_camera)
+        if pinhole is not None:
+            return moment.recorded or replace(pinhole, shutter=moment.shutter)
+        rays = self.lens(request.camera).rays[::8, ::8].reshape(-1, 3)
+        ahead = rays[rays[:, 2] > 0.1]
+        reach = (ahead[:, :2] / ahead[:, 2:]).abs().amax(dim=0).clamp(max=MIDDLE_TANGENT)
+        focal_px = EVIDENCE_WIDTH_PX / 2 / max(float(reach[0]), 0.05)
+        height_px = max(round(2 * focal_px * float(reach[1])), 8)
+        return Camera.centred(
+            moment.world_from_camera, focal_px, width_px=EVIDENCE_WIDTH_PX, height_px=height_px
+        )
+
+    def _distance(self, camera_name: str) -> EnvelopeDistance:
+        names = self.recorded.camera_names
+        name = camera_name if camera_name in names else names[0]
+        with self._lock:
+            if name not in self._distances:
+                views = self.recorded.views_of(name)
+                self._distances[name] = EnvelopeDistance(self.envelope or {}, self.recorded, views)
+            return self._distances[name]
+
+    def _own_body(self, request: SensorRequest) -> Bool[Tensor, "height width"]:
+        """Where a requested image shows the recording car itself."""
+        name = request.own_body_of
+        if name not in self.recorded.camera_names:
+            raise invalid(
+                f"ego_mask_id {name!r}: the scene has no such camera, it has "
+                f"{', '.join(self.recorded.camera_names)}"
+            )
+        lens, seen = self.lens(request.camera), self.scene.cameras.own_bodies.get(name)
+        if seen is None:
+            return torch.zeros_like(lens.is_seen)
+        camera = fit_camera(self.recorded.views_of(name)[0], self.observation)
+        camera = camera.resized(width_px=seen.shape[1], height_px=seen.shape[0])
+        return lens.meeting(seen, camera)
+
+
+def _same_lens(first: Camera, second: Camera) -> bool:
+    """Whether two pinholes are the same but for rounding."""
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    return all(abs(getattr(first, n) - getattr(second, n)) < 1e-6 * first.width_px for n in names)
+
+
+def _reads_alike(request: SensorRequest, camera: Camera) -> bool:
+    """Whether a request has the shutter of a recorded camera."""
+    shutter = camera.shutter
+    if shutter is None or not shutter.is_rolling:
+        return not request.readout_s
+    readout_s = sum(map(abs, shutter.across_s))
+    if any(
+        abs(asked - own) > 2e-6
+        for asked, own in zip(request.across_s, shutter.across_s, strict=True)
+    ):
+        return False
+    half = torch.stack([-shutter.twist_per_s, shutter.twist_per_s]) * (readout_s / 2)
+    ends = camera.world_from_camera.double() @ rigid_from_tangent(half)
+    return bool(same_pose(request.world_from_sensor, ends).all())
