@@ -31,6 +31,7 @@ from flows.cli import (
     painter,
     reconstruct,
     render,
+    serve,
     settings,
     stylize,
     view,
@@ -96,6 +97,7 @@ app.command("export")(export.export)
 app.command("stylize")(stylize.stylize)
 app.command("edit")(edit.edit)
 app.command("view")(view.view)
+app.command("serve")(serve.serve)
 app.command("evaluate")(evaluate.evaluate)
 app.command("chart")(measure.chart)
 app.command("size")(measure.size)

@@ -14,7 +14,7 @@ QUALITY = 95
 FALLING = (90, 80, 70, 55, 40, 25, 10)
 """Qualities that are tried one after the other until an image is small enough."""
 PLANAR = ""
-_ENDINGS = {
+_ENDINGS: dict[int, str] = {
     sensorsim_pb2.UNDEFINED: ".png",
     sensorsim_pb2.PNG: ".png",
     sensorsim_pb2.JPEG: ".jpg",

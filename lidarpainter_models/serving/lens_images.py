@@ -11,7 +11,8 @@ Camera frames: x right, y down, z forward.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from lidarpainter_models.gaussians.model.rolling_shutter import bodies_apart
 from lidarpainter_models.gaussians.model.scene_rendering import PosedScene, gaussians_at
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.gaussians.model.spatial_blocks import View
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.row_motion.reference import ReadingTimes, motion_by_times
 from lidarpainter_models.serving.sensor_cameras import SensorCamera
 
@@ -207,6 +208,19 @@ class ReadByLens(PosedScene):
     readout_s: float
     read_s: ReadingTimes
     """When points of the face's frame are read."""
+
+    @classmethod
+    def of_face(
+        cls,
+        posed: PosedScene,
+        rates: Float[Tensor, "bodies 3 4"],
+        shutter: Shutter,
+        read_s: ReadingTimes,
+    ) -> "ReadByLens":
+        """A scene before a face, and how the shutter of its lens reads it."""
+        own: dict[str, Any] = {each.name: getattr(posed, each.name) for each in fields(posed)}
+        readout_s = sum(map(abs, shutter.across_s))
+        return cls(**own, rates=rates, readout_s=readout_s, read_s=read_s)
 
     def looks(self) -> list[View]:
         """The face in the middle of the readout, at its beginning and at its end."""

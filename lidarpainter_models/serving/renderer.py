@@ -23,7 +23,6 @@ from lidarpainter_models.conditioning.followed_paths import found_camera
 from lidarpainter_models.conditioning.view_evidence import EVIDENCE_WIDTH_PX, EvidenceGatherer
 from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.gaussians.model.actors import PRESENCE_MARGIN_NS
-from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
 from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
@@ -236,32 +235,22 @@ class ServedScene:
         """What draws a face of a lens at a moment."""
         scene, shutter = moment.scene, moment.shutter
         poses = scene.actors.refined_poses(moment.taken_ns)
-        common = {
-            "taken_ns": moment.taken_ns,
-            "poses": poses,
-            "actors": scene.actors,
-            "blinking": scene.blinking,
-        }
         rates = None
         if shutter is not None:
             standing = Camera.centred(moment.world_from_camera, 1.0, width_px=1, height_px=1)
             rates = body_rates(standing, shutter, scene.actors, moment.taken_ns)
 
         def draw(face: Face) -> Float[Tensor, "height width 3"]:
-            pinhole = face.at(moment.world_from_camera)
-            seen = {
-                "camera": pinhole,
-                "bodies": camera_from_body(pinhole.world_from_camera, *poses),
-            }
-            posed = PosedScene(**common, **seen)
+            posed = PosedScene.of(
+                scene.actors,
+                scene.blinking,
+                face.at(moment.world_from_camera),
+                moment.taken_ns,
+                poses=poses,
+            )
             if rates is not None and shutter is not None:
-                posed = ReadByLens(
-                    **common,
-                    **seen,
-                    rates=rates,
-                    readout_s=sum(map(abs, shutter.across_s)),
-                    read_s=reading_times(camera, shutter.across_s, face.camera_from_face),
-                )
+                read_s = reading_times(camera, shutter.across_s, face.camera_from_face)
+                posed = ReadByLens.of_face(posed, rates, shutter, read_s)
             return scene.drawable_of(posed).render(camera_name=moment.camera_name).rgb
 
         return draw

@@ -136,7 +136,7 @@ def _windshield(spec: Any) -> Windshield | None:  # noqa: ANN401
             f"the windshield's {ending or 'forward'} polynomials have {len(found[0])} and "
             f"{len(found[1])} terms: expected 3, 6, 10, 15, 21, 28 or 36"
         )
-    return Windshield(*found, is_forward=is_forward)
+    return Windshield(horizontal=found[0], vertical=found[1], is_forward=is_forward)
 
 
 def _is_triangular(count: int) -> bool:

@@ -41,7 +41,7 @@ def service_names() -> tuple[str, ...]:
     return tuple(f"{package}.{SERVICE}" for package in PACKAGES)
 
 
-def calls() -> dict[str, tuple[type, type]]:
+def calls() -> dict[str, tuple[Any, Any]]:
     """Of every call its message and that of its reply."""
     found = sensorsim_pb2.DESCRIPTOR.services_by_name[SERVICE].methods
     return {
@@ -50,7 +50,7 @@ def calls() -> dict[str, tuple[type, type]]:
     }
 
 
-def _class_of(descriptor: Any) -> type:  # noqa: ANN401  protobuf has no type for it
+def _class_of(descriptor: Any) -> Any:  # noqa: ANN401  protobuf has no type for it
     module = common_pb2 if descriptor.file is common_pb2.DESCRIPTOR else sensorsim_pb2
     return getattr(module, descriptor.name)
 

@@ -1,0 +1,87 @@
+"""`lidarpainter serve`: runs as the renderer that driving simulators call."""
+
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.output import clear_status
+from flows.cli.shared_options import check_painter, described, named_run, parse_bytes, parse_seconds
+from lidarpainter_models.devices import check_device
+
+WORDS = """
+runs: Runs to serve, each by its id or the beginning of it, a scene such as pandaset/002 (its newest
+  run), or latest. Clients ask for the scene, or for the id where several runs show it.
+host: Address to listen on; 0.0.0.0 lets other machines in, and anybody on them.
+serve.port: Port of gRPC; 0 takes a free one.
+http_port: Port of NeuroNCAP's routes, which show the first run; without it there are none.
+paint: Paint every image, in agreement with the one that the same client asked of the camera before.
+serve.painter: Painter of the images, which it paints without --paint too; the run's own if absent.
+memory: How much scenes in memory may take together, such as 4GB; the one that was asked for longest
+  ago leaves.
+queue: How many requests may wait at a time; more are refused.
+serve.time_limit: How long a request may take, waiting included, such as 60s.
+refuse_below: Confidence from 0 to 1 below which an image is refused.
+log: CSV file that gets a row for every image: what was asked for, and how far it can be trusted.
+allow_shut_down: Let clients end the server.
+"""
+
+
+@described(WORDS)
+def serve(  # noqa: PLR0913 - the options of a command
+    runs: Annotated[list[str], typer.Argument()],
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
+    host: str = "127.0.0.1",
+    http_port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
+    paint: bool = False,
+    painter: str | None = None,
+    device: str = "auto",
+    memory: str = "4GB",
+    queue: Annotated[int, typer.Option(min=1, max=1000)] = 32,
+    time_limit: str = "60s",
+    refuse_below: Annotated[float, typer.Option(min=0, max=1)] = 0.0,
+    log: Path | None = None,
+    allow_shut_down: bool = False,
+) -> None:
+    """Serve finished runs to driving simulators over gRPC, until Ctrl-C.
+
+    It answers the calls of AlpaSim, NuRec and CARLA (SensorsimService), and those of NeuroNCAP.
+
+    Example: lidarpainter serve latest --log trust.csv
+    """
+    most_bytes, limit_s = parse_bytes(memory), parse_seconds(time_limit)
+    check_device(device)
+    run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
+    check_painter(painter)
+    from catalog.store import existing_store
+    from flows.serve import ServeRequest, serve_runs
+
+    def opened_at(address: str, http_address: str | None) -> None:
+        clear_status()
+        for one in (address, http_address):
+            if one is not None:
+                sys.stdout.write(f"{one}\n")
+        sys.stdout.flush()
+
+    serve_runs(
+        existing_store(),
+        ServeRequest(
+            runs=run_ids,
+            host=host,
+            port=port,
+            http_port=http_port,
+            is_painted=paint or painter is not None,
+            painter=painter,
+            device=device,
+            most_bytes=most_bytes,
+            most_waiting=queue,
+            limit_s=limit_s,
+            refuse_below=refuse_below,
+            log=log,
+            allows_shut_down=allow_shut_down,
+        ),
+        opened_at=opened_at,
+        stopped=threading.Event(),
+    )

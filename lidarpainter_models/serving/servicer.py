@@ -1,0 +1,266 @@
+"""The calls of simulators, each answered by the scenes of a pool or refused in one line."""
+
+import time
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import lidarpainter_models
+from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.serving import scene_messages
+from lidarpainter_models.serving.image_formats import encoded_within
+from lidarpainter_models.serving.messages import SensorRequest, read_request
+from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.refusals import Code, RequestError, invalid
+from lidarpainter_models.serving.render_queue import RenderQueue
+from lidarpainter_models.serving.scene_pool import ScenePool
+from lidarpainter_models.serving.trust import Trust, metadata
+from lidarpainter_models.serving.wire import MOST_BYTES, grpc_package
+
+if TYPE_CHECKING:
+    from grpc import ServicerContext
+
+MOST_BYTES_KEY = "lidarpainter-max-reply-bytes"
+"""Metadata of a request whose reply must not be larger: images become JPEGs as good as allowed."""
+MOST_ITEMS = 64
+"""Of a batch."""
+API_VERSION = (0, 0, 5)
+Answer = TypeVar("Answer", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What is noted of every image that was asked for."""
+
+    request: SensorRequest | None
+    """None where the message could not be read."""
+    trust: Trust
+    seconds: float
+    """From when the worker took it."""
+    refusal: str | None
+    """Why there is no image."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Made:
+    data: bytes = b""
+    trust: Trust = field(default_factory=Trust)
+    refusal: RequestError | None = None
+
+
+def answered(answer: Answer) -> Answer:
+    """Turn refusals into gRPC's status codes; whatever else fails is one line too."""
+
+    @wraps(answer)
+    def call(self: Any, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401
+        try:
+            return answer(self, message, context)
+        except RequestError as error:
+            code: Code | str = error.code
+            why = str(error)
+        except CancelledError:
+            code, why = "UNAVAILABLE", "the server ends"
+        except LidarPainterError as error:
+            code, why = "FAILED_PRECONDITION", str(error)
+        except Exception as error:  # noqa: BLE001 - a client gets a line, the server goes on
+            code, why = "INTERNAL", f"unexpected {type(error).__name__}: {error}".splitlines()[0]
+        return context.abort(getattr(grpc_package().StatusCode, code), why)
+
+    return call  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorsimServicer:
+    """All calls of the service, each by the name that is on the wire."""
+
+    scenes: ScenePool
+    queue: RenderQueue
+    refuse_below: float = 0.0
+    """Images that are trusted less are refused."""
+    tell: Callable[[Told], None] = lambda _told: None
+    """Is told of every image that was asked for."""
+    shut_down_asked: Callable[[], None] | None = None
+    """Ends the server when a client asks for it; None lets no client do that."""
+    config: dict[str, str]
+    """What the server was started with."""
+    is_painted: bool = False
+    """Whether images lean on those that the same client asked for before."""
+
+    @answered
+    def render_rgb(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        (made,) = self._made([message], context)
+        if made.refusal is not None:
+            raise made.refusal
+        return sensorsim_pb2.RGBRenderReturn(image_bytes=made.data)
+
+    @answered
+    def batch_render_rgb(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        found = self._made([item.request for item in message.items], context)
+        return sensorsim_pb2.BatchRGBRenderReturn(
+            items=[
+                sensorsim_pb2.BatchRGBRenderReturnItem(
+                    camera_name=item.camera_name,
+                    result=sensorsim_pb2.RGBRenderReturn(image_bytes=made.data),
+                    success=made.refusal is None,
+                    error_message="" if made.refusal is None else str(made.refusal),
+                )
+                for item, made in zip(message.items, found, strict=True)
+            ]
+        )
+
+    batch_render_camera = batch_render_rgb
+
+    @answered
+    def render_aggregated(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        if message.lidar_requests:
+            raise RequestError("UNIMPLEMENTED", "this server renders cameras, no LiDAR")
+        found = self._made(message.rgb_requests, context)
+        refusals = [made.refusal for made in found if made.refusal is not None]
+        if refusals:
+            raise refusals[0]
+        images = [sensorsim_pb2.RGBRenderReturn(image_bytes=made.data) for made in found]
+        return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=images)
+
+    @answered
+    def get_version(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        major, minor, patch = API_VERSION
+        return common_pb2.VersionId(
+            version_id=f"lidarpainter {lidarpainter_models.__version__}",
+            grpc_api_version=common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch),
+        )
+
+    @answered
+    def get_available_scenes(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return common_pb2.AvailableScenesReturn(scene_ids=self.scenes.announced)
+
+    @answered
+    def get_loaded_scenes(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        entry = sensorsim_pb2.LoadedScenesReturn.LoadedSceneEntry
+        return sensorsim_pb2.LoadedScenesReturn(
+            scenes=[
+                entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
+                for name in self.scenes.loaded()
+            ],
+            loaded_instance_capacity=len(self.scenes.announced),
+        )
+
+    @answered
+    def get_available_cameras(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return scene_messages.cameras(self.scenes.get(message.scene_id))
+
+    @answered
+    def get_available_trajectories(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return scene_messages.trajectories(self.scenes.get(message.scene_id))
+
+    @answered
+    def get_available_ego_masks(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        masks = []
+        for name in self.scenes.announced:
+            masks += scene_messages.ego_masks(name, self.scenes.get(name))
+        return sensorsim_pb2.AvailableEgoMasksReturn(ego_mask_metadata=masks)
+
+    @answered
+    def get_dynamic_objects(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return scene_messages.dynamic_objects(self.scenes.get(message.scene_id))
+
+    @answered
+    def get_server_config(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return sensorsim_pb2.ServerConfigReturn(server_config=self.config)
+
+    @answered
+    def shut_down(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        if self.shut_down_asked is None:
+            raise RequestError(
+                "FAILED_PRECONDITION", "the server was started without --allow-shut-down"
+            )
+        self.shut_down_asked()
+        return common_pb2.Empty()
+
+    @answered
+    def render_lidar(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        raise RequestError("UNIMPLEMENTED", "this server renders cameras, no LiDAR")
+
+    @answered
+    def get_external_asset_objects(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        raise RequestError("UNIMPLEMENTED", "this server has no assets from outside of its scenes")
+
+    @answered
+    def edit_assets(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        raise RequestError(
+            "UNIMPLEMENTED", "scenes are edited by `lidarpainter edit`, whose runs are served too"
+        )
+
+    @answered
+    def restore_model_parameters(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        raise RequestError("UNIMPLEMENTED", "this server changes no scene")
+
+    def _made(self, messages: Sequence[Any], context: "ServicerContext") -> list[_Made]:
+        """The images of a message, drawn together; each is there or says why it is not."""
+        if not 0 < len(messages) <= MOST_ITEMS:
+            raise invalid(f"a batch of {len(messages)} images: expected 1 to {MOST_ITEMS}")
+        client, most_bytes = context.peer() if self.is_painted else "", _most_bytes(context)
+        share = most_bytes // len(messages) - 256  # of names and of the message itself
+        key: Hashable = (
+            tuple(each.SerializeToString(deterministic=True) for each in messages),
+            most_bytes,
+            client,
+        )
+        found = self.queue.answer(
+            key, lambda: self._draw(messages, share, client), context.time_remaining()
+        )
+        context.set_trailing_metadata(metadata([made.trust for made in found]))
+        if sum(len(made.data) for made in found) > most_bytes:
+            raise RequestError(
+                "RESOURCE_EXHAUSTED",
+                f"the reply is larger than {most_bytes} bytes: ask for fewer images or for JPEG, "
+                f"or say {MOST_BYTES_KEY}",
+            )
+        return found
+
+    def _draw(self, messages: Sequence[Any], share: int, client: str) -> list[_Made]:
+        def draw(message: Any) -> _Made:  # noqa: ANN401
+            return self._drawn(message, share, client)
+
+        return list(side_by_side(draw, messages))
+
+    def _drawn(self, message: Any, share: int, client: str) -> _Made:  # noqa: ANN401
+        begun, request, made = time.perf_counter(), None, _Made()
+        try:
+            request = read_request(message)
+            frame = self.scenes.get(request.scene_id).frame(request, client)
+            made = _Made(trust=frame.trust)
+            self._refuse_untrusted(frame.trust)
+            data = encoded_within(frame.rgb_u8, request.encoding, share)
+            made = replace(made, data=data)
+        except LidarPainterError as error:
+            refusal = error
+            if not isinstance(refusal, RequestError):
+                refusal = RequestError("FAILED_PRECONDITION", str(error))
+            made = replace(made, refusal=refusal)
+        seconds = time.perf_counter() - begun
+        why = None if made.refusal is None else str(made.refusal)
+        self.tell(Told(request=request, trust=made.trust, seconds=seconds, refusal=why))
+        return made
+
+    def _refuse_untrusted(self, trust: Trust) -> None:
+        confidence = trust.confidence
+        if confidence is not None and confidence < self.refuse_below:
+            raise RequestError(
+                "FAILED_PRECONDITION",
+                f"the frame's confidence is {confidence:.2f}: expected {self.refuse_below:g} or "
+                "more by --refuse-below",
+            )
+
+
+def _most_bytes(context: "ServicerContext") -> int:
+    """How large a reply may be."""
+    asked = dict(context.invocation_metadata() or ()).get(MOST_BYTES_KEY)
+    if asked is None:
+        return MOST_BYTES - 2**16
+    text = asked.decode("ascii", "replace") if isinstance(asked, bytes) else asked
+    if not text.isdecimal() or not 1000 <= int(text[:12]) <= MOST_BYTES:
+        raise invalid(f"{MOST_BYTES_KEY} {text[:40]!r}: expected 1000 to {MOST_BYTES}")
+    return int(text)
