@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
-from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,29 +16,13 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import SequenceConfig
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.serving.placed_actors import Moment
 
 LONGEST_GAP_NS = 500_000_000
 MOST_STREAMS = 64
 """Of one scene; the one that was asked longest ago is forgotten."""
-
-
-class PaintedMoment(Protocol):
-    """What is painted: the scene with its actors in place, and when."""
-
-    @property
-    def scene(self) -> GaussianScene: ...  # noqa: D102
-
-    @property
-    def camera_name(self) -> str: ...  # noqa: D102
-
-    @property
-    def taken_ns(self) -> int: ...  # noqa: D102
-
-    @property
-    def timestamp_ns(self) -> int: ...  # noqa: D102
 
 
 @dataclass(eq=False)
@@ -57,7 +40,7 @@ class PaintedStreams:
     _lock: Lock = field(default_factory=Lock)
 
     def painter(
-        self, moment: PaintedMoment, builder: ConditionBuilder, client: str
+        self, moment: Moment, builder: ConditionBuilder, client: str
     ) -> Callable[[str, Camera], Float[Tensor, "height width 3"]]:
         """What paints one image of a moment: a function of a face's name and its camera."""
         shown = builder
@@ -69,7 +52,7 @@ class PaintedStreams:
 
     def _paint(
         self,
-        moment: PaintedMoment,
+        moment: Moment,
         builder: ConditionBuilder,
         client: str,
         face: str,
@@ -82,9 +65,7 @@ class PaintedStreams:
             stream.taken_ns = moment.taken_ns
         return painted.rgb.clamp(0, 1)
 
-    def _stream(
-        self, key: tuple[str, ...], moment: PaintedMoment, builder: ConditionBuilder
-    ) -> _Stream:
+    def _stream(self, key: tuple[str, ...], moment: Moment, builder: ConditionBuilder) -> _Stream:
         known = self._streams.pop(key, None)
         if known is None or not 0 < moment.taken_ns - known.taken_ns <= LONGEST_GAP_NS:
             painter = SequencePainter(

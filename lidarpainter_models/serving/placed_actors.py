@@ -11,6 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation, rigid_from_tangent
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.messages import SensorRequest, middle_of
@@ -40,6 +42,21 @@ class PlacedActors(Actors):
     def refined_poses(self, timestamp_ns: int) -> ActorPoses:
         """The same: where actors are put needs no correction."""
         return self.recorded_poses(timestamp_ns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moment:
+    """What a request shows: the scene with its actors in place, when, and from where."""
+
+    scene: GaussianScene
+    camera_name: str
+    taken_ns: int
+    timestamp_ns: int
+    """Of the image as recorded; not `taken_ns` where a camera's clock was found wrong."""
+    recorded: Camera | None
+    """The recorded camera, where the request is of one; None for all else."""
+    world_from_camera: Float[Tensor, "4 4"]
+    shutter: Shutter | None
 
 
 def same_pose(first: Tensor, second: Tensor) -> Tensor:

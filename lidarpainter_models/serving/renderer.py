@@ -36,7 +36,12 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
 from lidarpainter_models.serving.messages import SensorRequest
 from lidarpainter_models.serving.painted_streams import PaintedStreams
-from lidarpainter_models.serving.placed_actors import placed_actors, same_pose, twists_of
+from lidarpainter_models.serving.placed_actors import (
+    Moment,
+    placed_actors,
+    same_pose,
+    twists_of,
+)
 from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.sensor_cameras import SensorCamera
 from lidarpainter_models.serving.trust import EnvelopeDistance, Trust
@@ -55,21 +60,6 @@ class Frame:
 
     rgb_u8: UInt8[np.ndarray, "height width 3"]
     trust: Trust
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Moment:
-    """What a request shows: the scene with its actors in place, when, and from where."""
-
-    scene: GaussianScene
-    camera_name: str
-    taken_ns: int
-    timestamp_ns: int
-    """Of the image as recorded; not `taken_ns` where a camera's clock was found wrong."""
-    recorded: Camera | None
-    """The recorded camera, where the request is of one; None for all else."""
-    world_from_camera: Float[Tensor, "4 4"]
-    shutter: Shutter | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,10 +8,9 @@ alike.
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf import descriptor_pb2
-from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from lidarpainter_models.errors import ConfigError
@@ -70,7 +69,7 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def described_services() -> DescriptorPool:
+def described_services() -> Any:  # noqa: ANN401  upb has a pool of its own
     """Descriptors of the service under each of its names."""
     from grpc_health.v1 import health_pb2
 
@@ -91,7 +90,7 @@ def described_services() -> DescriptorPool:
     return pool
 
 
-def _proto_of(file: FileDescriptor) -> descriptor_pb2.FileDescriptorProto:
+def _proto_of(file: Any) -> descriptor_pb2.FileDescriptorProto:  # noqa: ANN401
     proto = descriptor_pb2.FileDescriptorProto()
     file.CopyToProto(proto)
     return proto
