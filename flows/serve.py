@@ -55,6 +55,8 @@ class ServeRequest:
     is_painted: bool = False
     painter: str | None = None
     """Name of the painter; None takes each run's own."""
+    is_measured: bool = True
+    """Whether the confidence of every image is measured."""
     device: Device = "auto"
     most_bytes: int = 4_000_000_000
     """Of scenes in memory."""
@@ -136,12 +138,18 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
     envelopes = (one.result.get(ENVELOPE) for one in lineage(store, run))
     envelope = next((found for found in envelopes if found), None)
     return load_served(
-        viewed, envelope, device=request.device, is_painted=request.is_painted, name=run.run_id
+        viewed,
+        envelope,
+        device=request.device,
+        is_painted=request.is_painted,
+        is_measured=request.is_measured,
+        name=run.run_id,
     )
 
 
 def _config(request: ServeRequest) -> dict[str, str]:
     return {
+        "confidence": str(request.is_measured).lower(),
         "painted": str(request.is_painted).lower(),
         "memory_bytes": str(request.most_bytes),
         "queue": str(request.most_waiting),

@@ -10,6 +10,7 @@ import typer
 from flows.cli.output import clear_status
 from flows.cli.shared_options import check_painter, described, named_run, parse_bytes, parse_seconds
 from lidarpainter_models.devices import check_device
+from lidarpainter_models.errors import ConfigError
 
 WORDS = """
 runs: Runs to serve, each by its id or the beginning of it, a scene such as pandaset/002 (its newest
@@ -23,6 +24,8 @@ memory: How much scenes in memory may take together, such as 4GB; the one that w
   ago leaves.
 queue: How many requests may wait at a time; more are refused.
 serve.time_limit: How long a request may take, waiting included, such as 60s.
+trust: Measure how far each image can be trusted, which takes longer than to draw it, or leave it
+  out.
 refuse_below: Confidence from 0 to 1 below which an image is refused.
 log: CSV file that gets a row for every image: what was asked for, and how far it can be trusted.
 allow_shut_down: Let clients end the server.
@@ -41,6 +44,7 @@ def serve(  # noqa: PLR0913 - the options of a command
     memory: str = "4GB",
     queue: Annotated[int, typer.Option(min=1, max=1000)] = 32,
     time_limit: str = "60s",
+    trust: Annotated[bool, typer.Option("--trust/--no-trust")] = True,
     refuse_below: Annotated[float, typer.Option(min=0, max=1)] = 0.0,
     log: Path | None = None,
     allow_shut_down: bool = False,
@@ -53,6 +57,8 @@ def serve(  # noqa: PLR0913 - the options of a command
     """
     most_bytes, limit_s = parse_bytes(memory), parse_seconds(time_limit)
     check_device(device)
+    if refuse_below and not trust:
+        raise ConfigError("--refuse-below needs the confidence that --no-trust leaves out")
     run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
     check_painter(painter)
     from catalog.store import existing_store
@@ -74,6 +80,7 @@ def serve(  # noqa: PLR0913 - the options of a command
             http_port=http_port,
             is_painted=paint or painter is not None,
             painter=painter,
+            is_measured=trust,
             device=device,
             most_bytes=most_bytes,
             most_waiting=queue,

@@ -9,7 +9,7 @@ World: x forward, y left, z up, from where the recording began; metres.
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -28,6 +28,7 @@ from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
 from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -73,6 +74,8 @@ class ServedScene:
     observation: ObservationConfig
     calibration: Calibration
     envelope: Mapping[str, Any] | None = None
+    is_measured: bool = True
+    """Whether the confidence of frames is measured, which takes longer than to draw them."""
     streams: PaintedStreams | None = None
     """Paints images; None shows the scene as it is."""
     _lenses: OrderedDict[SensorCamera, LensImage] = field(default_factory=OrderedDict, init=False)
@@ -102,7 +105,7 @@ class ServedScene:
     @cached_property
     def evidence(self) -> EvidenceGatherer | None:
         """Measures what speaks for a view; None in a style, which has no true images."""
-        if self.scene.style is not None:
+        if not self.is_measured or self.scene.style is not None:
             return None
         builder = self.builder
         return EvidenceGatherer(self.scene, builder.lidar_map, builder.training_views)
@@ -122,11 +125,15 @@ class ServedScene:
         painter = None
         if self.streams is not None:
             painter = self.streams.painter(moment, self.builder, client)
-        rgb = self._image(request, moment, painter)
+        rgb, trust = both(
+            partial(self._image, request, moment, painter),
+            partial(self.trust, request, moment),
+            self.scene.device,
+        )
         if request.own_body_of is not None:
             rgb = torch.where(self._own_body(request)[..., None], 0.0, rgb)
         rgb_u8 = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return Frame(rgb_u8=rgb_u8, trust=self.trust(request, moment))
+        return Frame(rgb_u8=rgb_u8, trust=trust)
 
     def trust(self, request: SensorRequest, moment: Moment | None = None) -> Trust:
         """How far the image of a request can be trusted, before anybody paints it."""

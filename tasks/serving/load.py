@@ -24,6 +24,7 @@ def load_served(
     *,
     device: Device,
     is_painted: bool,
+    is_measured: bool,
     name: str,
 ) -> LoadedScene:
     """Load what a run's images are made from.
@@ -50,6 +51,7 @@ def load_served(
         observation=viewed.observation,
         calibration=viewed.calibration,
         envelope=envelope,
+        is_measured=is_measured,
         streams=streams,
     )
     files = [this.store.artefacts.files(ref) for ref in (fitted.gaussians, fitted.observations)]
