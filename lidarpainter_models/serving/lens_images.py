@@ -30,13 +30,14 @@ from lidarpainter_models.serving.sensor_cameras import SensorCamera
 
 ONE_FACE_RAD = math.radians(55)
 """Half of 110 degrees: beyond it one pinhole image has too many pixels at its rim."""
-DENSITY = 1.25
+DENSITY = 1.1
 """Pixels of a face per pixel of the lens where the lens is finest, along one axis."""
 MOST_PIXELS = 4.0
 """Pixels of all faces together per pixel of the image; beyond it faces are coarser."""
 MARGIN_PX = 4
 """Around what rays meet of a face: resampling looks at neighbours."""
-_CUBE = {
+Rows = tuple[tuple[int, int, int], ...]
+_CUBE: dict[tuple[int, int], Rows] = {
     (2, 1): ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # ahead
     (0, 1): ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),  # right
     (0, -1): ((0, 0, -1), (0, 1, 0), (1, 0, 0)),  # left
@@ -86,25 +87,19 @@ class LensImage:
         rays, is_seen = camera.pixel_rays()
         seen = rays[is_seen]
         one_face = bool((seen[:, 2] > math.cos(ONE_FACE_RAD)).all())
-        largest = torch.zeros_like(is_seen, dtype=torch.int64)
+        largest = rays.abs().argmax(dim=-1)
         if one_face:
-            largest += 2
-        else:
-            largest = rays.abs().argmax(dim=-1)
+            largest = torch.full_like(largest, 2)
         sign = torch.gather(rays, -1, largest[..., None])[..., 0].sign()
-        focal_px = _density(rays, is_seen) * DENSITY
-        wanted = [
-            (turn, is_seen & (largest == axis) & (sign == side))
-            for (axis, side), turn in _CUBE.items()
+        parts = [
+            _Part.of(str(number), rays, is_seen & (largest == axis) & (sign == side), turn)
+            for number, ((axis, side), turn) in enumerate(_CUBE.items())
         ]
-        areas = [_area(turn, rays, own) for turn, own in wanted if bool(own.any())]
+        met = [part for part in parts if part is not None]
         most = MOST_PIXELS * is_seen.numel()
-        focal_px *= min(1.0, math.sqrt(most / max(sum(areas) * focal_px**2, 1e-9)))
-        faces = [
-            _face(str(number), turn, rays, own, focal_px)
-            for number, (turn, own) in enumerate(wanted)
-            if bool(own.any())
-        ]
+        wanted = sum(part.area * part.focal_px**2 for part in met)
+        coarser = min(1.0, math.sqrt(most / max(wanted, 1.0)))
+        faces = [part.face(coarser * part.focal_px) for part in met]
         return cls(camera=camera, faces=tuple(faces), is_seen=is_seen, rays=rays.float())
 
     def drawn(
@@ -133,65 +128,81 @@ class LensImage:
         return inside & mask[row.clamp(0, high - 1), column.clamp(0, wide - 1)]
 
 
-def _tangents(turn: tuple[tuple[int, ...], ...], rays: Tensor, own: Tensor) -> Tensor:
-    """Where the rays of some pixels meet a face one unit ahead."""
-    seen = rays[own] @ rays.new_tensor(turn)
-    return seen[:, :2] / seen[:, 2:]
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The rays of a lens that meet one face, one unit ahead of it."""
+
+    name: str
+    turn: Rows
+    own: Bool[Tensor, "height width"]
+    met: Float[Tensor, "height width 2"]
+    """Where; means nothing but for the own ones."""
+    focal_px: float
+    """At which the face is as fine as wanted."""
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        rays: Float[Tensor, "height width 3"],
+        own: Bool[Tensor, "height width"],
+        turn: Rows,
+    ) -> "_Part | None":
+        """None where no ray meets the face."""
+        if not bool(own.any()):
+            return None
+        seen = rays @ rays.new_tensor(turn)
+        met = seen[..., :2] / torch.where(own, seen[..., 2], 1.0)[..., None]
+        return cls(name, turn, own, met, DENSITY / _finest_step(met, own))
+
+    @property
+    def area(self) -> float:
+        """Of the rectangle that holds what is met."""
+        met = self.met[self.own]
+        return float((met.amax(0) - met.amin(0)).prod())
+
+    def face(self, focal_px: float) -> Face:
+        """The face with pixels so fine."""
+        met = self.met[self.own] * focal_px
+        low = (met.amin(0).floor() - MARGIN_PX).tolist()
+        high = (met.amax(0).ceil() + MARGIN_PX).tolist()
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.tensor(self.turn, dtype=torch.float64)
+        pinhole = Camera(
+            world_from_camera=pose,
+            fx_px=focal_px,
+            fy_px=focal_px,
+            cx_px=-low[0],
+            cy_px=-low[1],
+            width_px=round(high[0] - low[0]),
+            height_px=round(high[1] - low[1]),
+        )
+        rows, columns = (_reach(self.own.any(dim=axis)) for axis in (1, 0))
+        part = self.own[rows, columns]
+        places = torch.zeros(*part.shape, 2, dtype=torch.float32)
+        places[part] = (met - met.new_tensor(low) - 0.5).float()
+        return Face(
+            name=self.name,
+            camera_from_face=pose,
+            pinhole=pinhole,
+            rows=rows,
+            columns=columns,
+            is_own=part.numpy(),
+            places=(places[..., 0].contiguous().numpy(), places[..., 1].contiguous().numpy()),
+        )
 
 
-def _area(turn: tuple[tuple[int, ...], ...], rays: Tensor, own: Tensor) -> float:
-    """Of what rays meet of a face one unit ahead."""
-    met = _tangents(turn, rays, own)
-    return float((met.amax(0) - met.amin(0)).prod())
-
-
-def _density(rays: Float[Tensor, "height width 3"], is_seen: Bool[Tensor, "height width"]) -> float:
-    """Pixels per radian where the lens is finest, but for a hundredth of its pixels."""
+def _finest_step(met: Float[Tensor, "height width 2"], own: Bool[Tensor, "height width"]) -> float:
+    """Between neighbouring pixels on a face, but for the hundredth that are nearest together."""
     steps = []
     for axis in (0, 1):
-        both = is_seen.narrow(axis, 1, is_seen.shape[axis] - 1)
-        both = both & is_seen.narrow(axis, 0, is_seen.shape[axis] - 1)
-        steps.append(rays.diff(dim=axis).norm(dim=-1)[both])
+        count = own.shape[axis] - 1
+        both = own.narrow(axis, 1, count) & own.narrow(axis, 0, count)
+        steps.append(met.diff(dim=axis).norm(dim=-1)[both])
     found = torch.cat(steps)
     if not len(found):
         return 1.0
-    return float(1 / found.kthvalue(1 + len(found) // 100).values.clamp(min=1e-6))
-
-
-def _face(
-    name: str,
-    turn: tuple[tuple[int, ...], ...],
-    rays: Float[Tensor, "height width 3"],
-    own: Bool[Tensor, "height width"],
-    focal_px: float,
-) -> Face:
-    met = _tangents(turn, rays, own) * focal_px
-    low = (met.amin(0).floor() - MARGIN_PX).tolist()
-    high = (met.amax(0).ceil() + MARGIN_PX).tolist()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor(turn, dtype=torch.float64)
-    pinhole = Camera(
-        world_from_camera=pose,
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=-low[0],
-        cy_px=-low[1],
-        width_px=round(high[0] - low[0]),
-        height_px=round(high[1] - low[1]),
-    )
-    rows, columns = (_reach(own.any(dim=axis)) for axis in (1, 0))
-    part = own[rows, columns]
-    places = torch.zeros(*part.shape, 2, dtype=torch.float32)
-    places[part] = (met - met.new_tensor(low) - 0.5).float()
-    return Face(
-        name=name,
-        camera_from_face=pose,
-        pinhole=pinhole,
-        rows=rows,
-        columns=columns,
-        is_own=part.numpy(),
-        places=(places[..., 0].contiguous().numpy(), places[..., 1].contiguous().numpy()),
-    )
+    return float(found.kthvalue(1 + len(found) // 100).values.clamp(min=1e-6))
 
 
 def _reach(is_there: Bool[Tensor, " places"]) -> slice:

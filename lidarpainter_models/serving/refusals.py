@@ -17,11 +17,15 @@ Code = Literal[
 """The status codes of gRPC that the server answers with."""
 
 
+MOST_WORDS = 1000
+"""Characters of a refusal: what was sent is quoted in it, and clients take 8 kB of them."""
+
+
 class RequestError(LidarPainterError, ValueError):
     """A request that is not answered with what it asks for."""
 
     def __init__(self, code: Code, message: str) -> None:
-        super().__init__(message)
+        super().__init__(message if len(message) <= MOST_WORDS else f"{message[:MOST_WORDS]}...")
         self.code = code
 
 

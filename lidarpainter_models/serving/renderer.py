@@ -49,8 +49,8 @@ from lidarpainter_models.serving.trust import EnvelopeDistance, Trust
 
 SAME_TIME_NS = 1_500
 """Up to which a request is of a recorded moment: messages count in microseconds."""
-MOST_LENSES = 24
-"""Whose rays are kept: those of a rig or two."""
+MOST_RAYS = 2**24
+"""Of lenses that are kept: of a rig of six cameras at 1920 x 1080."""
 MIDDLE_TANGENT = 1.4
 """Of the part of a wide lens that its trust is measured on: 109 degrees across."""
 
@@ -257,10 +257,13 @@ class ServedScene:
         with self._lock:
             if camera not in self._lenses:
                 self._lenses[camera] = LensImage.of(camera)
-                if len(self._lenses) > MOST_LENSES:
+                while len(self._lenses) > 1 and self._num_rays() > MOST_RAYS:
                     self._lenses.popitem(last=False)
             self._lenses.move_to_end(camera)
             return self._lenses[camera]
+
+    def _num_rays(self) -> int:
+        return sum(each.is_seen.numel() for each in self._lenses.values())
 
     def _looked_at(self, request: SensorRequest, moment: Moment) -> Camera:
         """A pinhole that sees what an image shows, or the middle part of it."""

@@ -15,8 +15,8 @@ from lidarpainter_models.serving.sensor_cameras import (
 )
 
 MOST_SIDE_PX = 8192
-MOST_PIXELS = 2**24
-"""Of an image: 5000 x 3355."""
+MOST_PIXELS = 2**23
+"""Of an image: 3840 x 2160 is within."""
 MOST_TERMS = 24
 """Of a polynomial in one variable."""
 MOST_OF_TWO = 36

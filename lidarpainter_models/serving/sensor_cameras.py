@@ -33,6 +33,8 @@ STEP = 1e-6
 """Over which slopes of functions of two variables are taken."""
 EXACT_PX = 1e-3
 """A pixel whose ray falls farther from it than this has no ray."""
+STRIP = 2**18
+"""Pixels whose rays are found at a time."""
 WIDEST_TANGENT = 20.0
 """Of a pinhole: 87 degrees from the axis."""
 Plane = Callable[[Tensor], Tensor]
@@ -311,10 +313,19 @@ class SensorCamera:
 
         Each ray is checked: it falls on its pixel again.
         """
-        down, across = (
-            torch.arange(count, dtype=torch.float64) + 0.5
-            for count in (self.height_px, self.width_px)
-        )
+        rows = max(STRIP // self.width_px, 1)
+        strips = [
+            self._rays_of_rows(first, min(first + rows, self.height_px))
+            for first in range(0, self.height_px, rows)
+        ]
+        rays, is_seen = zip(*strips, strict=True)
+        return torch.cat(rays), torch.cat(is_seen)
+
+    def _rays_of_rows(
+        self, first: int, last: int
+    ) -> tuple[Float[Tensor, "rows width 3"], Bool[Tensor, "rows width"]]:
+        down = torch.arange(first, last, dtype=torch.float64) + 0.5
+        across = torch.arange(self.width_px, dtype=torch.float64) + 0.5
         grid = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)
         inverse = torch.linalg.inv(self._matrix)
         seen, within = self.lens.rays_of((grid - grid.new_tensor(self.middle_px)) @ inverse.T)
