@@ -186,7 +186,7 @@ class CameraSpec(_message.Message):
     def __init__(self, temporary_camera_spec: _Optional[str] = ..., ftheta_param: _Optional[_Union[FthetaCameraParam, _Mapping]] = ..., opencv_pinhole_param: _Optional[_Union[OpenCVPinholeCameraParam, _Mapping]] = ..., opencv_fisheye_param: _Optional[_Union[OpenCVFisheyeCameraParam, _Mapping]] = ..., logical_id: _Optional[str] = ..., trajectory_idx: _Optional[int] = ..., resolution_h: _Optional[int] = ..., resolution_w: _Optional[int] = ..., shutter_type: _Optional[_Union[ShutterType, str]] = ..., bivariate_windshield_model_param: _Optional[_Union[BivariateWindshieldModelParameters, _Mapping]] = ...) -> None: ...
 
 class RGBRenderRequest(_message.Message):
-    __slots__ = ("scene_id", "resolution_h", "resolution_w", "camera_intrinsics", "frame_start_us", "frame_end_us", "sensor_pose", "dynamic_objects", "image_format", "image_quality", "insert_ego_mask", "ego_mask_id")
+    __slots__ = ("scene_id", "resolution_h", "resolution_w", "camera_intrinsics", "frame_start_us", "frame_end_us", "sensor_pose", "dynamic_objects", "image_format", "image_quality", "insert_ego_mask", "ego_mask_id", "ego_pose")
     SCENE_ID_FIELD_NUMBER: _ClassVar[int]
     RESOLUTION_H_FIELD_NUMBER: _ClassVar[int]
     RESOLUTION_W_FIELD_NUMBER: _ClassVar[int]
@@ -199,6 +199,7 @@ class RGBRenderRequest(_message.Message):
     IMAGE_QUALITY_FIELD_NUMBER: _ClassVar[int]
     INSERT_EGO_MASK_FIELD_NUMBER: _ClassVar[int]
     EGO_MASK_ID_FIELD_NUMBER: _ClassVar[int]
+    EGO_POSE_FIELD_NUMBER: _ClassVar[int]
     scene_id: str
     resolution_h: int
     resolution_w: int
@@ -211,7 +212,8 @@ class RGBRenderRequest(_message.Message):
     image_quality: float
     insert_ego_mask: bool
     ego_mask_id: EgoMaskId
-    def __init__(self, scene_id: _Optional[str] = ..., resolution_h: _Optional[int] = ..., resolution_w: _Optional[int] = ..., camera_intrinsics: _Optional[_Union[CameraSpec, _Mapping]] = ..., frame_start_us: _Optional[int] = ..., frame_end_us: _Optional[int] = ..., sensor_pose: _Optional[_Union[PosePair, _Mapping]] = ..., dynamic_objects: _Optional[_Iterable[_Union[DynamicObject, _Mapping]]] = ..., image_format: _Optional[_Union[ImageFormat, str]] = ..., image_quality: _Optional[float] = ..., insert_ego_mask: _Optional[bool] = ..., ego_mask_id: _Optional[_Union[EgoMaskId, _Mapping]] = ...) -> None: ...
+    ego_pose: PosePair
+    def __init__(self, scene_id: _Optional[str] = ..., resolution_h: _Optional[int] = ..., resolution_w: _Optional[int] = ..., camera_intrinsics: _Optional[_Union[CameraSpec, _Mapping]] = ..., frame_start_us: _Optional[int] = ..., frame_end_us: _Optional[int] = ..., sensor_pose: _Optional[_Union[PosePair, _Mapping]] = ..., dynamic_objects: _Optional[_Iterable[_Union[DynamicObject, _Mapping]]] = ..., image_format: _Optional[_Union[ImageFormat, str]] = ..., image_quality: _Optional[float] = ..., insert_ego_mask: _Optional[bool] = ..., ego_mask_id: _Optional[_Union[EgoMaskId, _Mapping]] = ..., ego_pose: _Optional[_Union[PosePair, _Mapping]] = ...) -> None: ...
 
 class RGBRenderReturn(_message.Message):
     __slots__ = ("image_bytes",)
