@@ -180,6 +180,12 @@ def _numbers(pose: Any) -> list[float]:  # noqa: ANN401  a Pose
     return [vec.x, vec.y, vec.z, quat.w, quat.x, quat.y, quat.z]
 
 
+def matrix_of(pose: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  a Pose
+    """The transform (float64) that a pose's message says; `pose_message` the other way round."""
+    numbers = torch.tensor(_numbers(pose), dtype=torch.float64)
+    return rigid_from_rotation(rotation_from_quaternion(numbers[3:]), numbers[:3])
+
+
 def pose_message(world_from_body: Float[Tensor, "4 4"]) -> Any:  # noqa: ANN401  a Pose
     """A pose as a message; float32 there."""
     x, y, z = world_from_body[:3, 3].tolist()

@@ -40,6 +40,7 @@ def slow(*case):
         ("bench_fleet.py", ("2",), "2 sequences:"),
         ("bench_nuscenes_tables.py", ("--rows", "1000"), "1,000"),
         ("bench_questions.py", ("5",), "5 scenes, 35 artefacts"),
+        ("bench_serving.py", ("--quick",), "fisheye of 190 degrees:"),
         ("bench_one_step.py", ("costs", "--size", "64x64"), "{"),
         slow("bench_length.py", ("--quick",), "... over"),
         slow("bench_waymo_reader.py", ("--frames", "1"), "v2:"),

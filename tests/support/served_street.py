@@ -24,7 +24,7 @@ from lidarpainter_models.synthetic import SyntheticStreet, write_street
 class ServedStreet:
     """The street, the scene that a fit of it starts with, and the scene that answers."""
 
-    def __init__(self, folder, *, street=None, fit=None):
+    def __init__(self, folder, *, street=None, fit=None, num_gaussians=2000):
         self.config = street or tiny_street()
         self.street = SyntheticStreet(self.config)
         self.recording = DrivingScene.open(write_street(self.config, folder))
@@ -32,7 +32,9 @@ class ServedStreet:
         split = lp.split_views(self.recording, "alternate", None)
         self.seen = lp.prepare_observations(self.recording, split, self.size)
         if fit is None:
-            self.scene = initialise_scene(self.seen, InitialisationConfig(num_gaussians=2000))
+            self.scene = initialise_scene(
+                self.seen, InitialisationConfig(num_gaussians=num_gaussians)
+            )
         else:
             self.scene = lp.fit_gaussians(self.seen, fit).scene
 
