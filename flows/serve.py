@@ -11,7 +11,7 @@ from pathlib import Path
 
 from catalog.store import Store
 from flows.views import viewed_run
-from lidarpainter_models.devices import Device
+from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import WriteError
 from lidarpainter_models.evaluation.score_tables import ENVELOPE
 from lidarpainter_models.export.view_requests import ViewRequest
@@ -96,6 +96,7 @@ def serve_runs(
             tell=tell,
             shut_down_asked=stopped.set if request.allows_shut_down else None,
             config=_config(request),
+            device=chosen_device(request.device),
             is_painted=request.is_painted,
         )
         address = None

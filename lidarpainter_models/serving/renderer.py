@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
@@ -79,6 +79,9 @@ class ServedScene:
     streams: PaintedStreams | None = None
     """Paints images; None shows the scene as it is."""
     _lenses: OrderedDict[SensorCamera, LensImage] = field(default_factory=OrderedDict, init=False)
+    _views: dict[str, tuple[tuple[RecordedView, ...], Tensor]] = field(
+        default_factory=dict, init=False
+    )
     _distances: dict[str, EnvelopeDistance] = field(default_factory=dict, init=False)
     _lock: Lock = field(default_factory=Lock, init=False)
 
@@ -191,8 +194,11 @@ class ServedScene:
         self, request: SensorRequest, middle: Float[Tensor, "4 4"]
     ) -> tuple[RecordedView, Camera] | None:
         """The recorded view that a request is of, and its camera at the size asked for."""
-        view = self._views.get(request.camera_name, {}).get(round(request.middle_ns / 1e6))
-        if view is None or abs(view.timestamp_ns - request.middle_ns) > SAME_TIME_NS:
+        if request.camera_name not in self.recorded.camera_names:
+            return None
+        views, times_ns = self._views_of(request.camera_name)
+        view = views[int((times_ns - request.middle_ns).abs().argmin())]
+        if abs(view.timestamp_ns - request.middle_ns) > SAME_TIME_NS:
             return None
         size = {"width_px": request.camera.width_px, "height_px": request.camera.height_px}
         camera = self.found(view, view.camera.resized(**size))
@@ -200,13 +206,12 @@ class ServedScene:
             return None
         return (view, camera) if _reads_alike(request, camera) else None
 
-    @cached_property
-    def _views(self) -> dict[str, dict[int, RecordedView]]:
-        """Recorded views by camera, and by time in milliseconds."""
-        return {
-            name: {round(view.timestamp_ns / 1e6): view for view in self.recorded.views_of(name)}
-            for name in self.recorded.camera_names
-        }
+    def _views_of(self, name: str) -> tuple[tuple[RecordedView, ...], Int[Tensor, " views"]]:
+        """The recorded views of a camera, and when they were taken."""
+        if name not in self._views:
+            views = self.recorded.views_of(name)
+            self._views[name] = (views, torch.tensor([view.timestamp_ns for view in views]))
+        return self._views[name]
 
     def _image(
         self,
@@ -233,7 +238,7 @@ class ServedScene:
         scene, shutter = moment.scene, moment.shutter
         poses = scene.actors.refined_poses(moment.taken_ns)
         rates = None
-        if shutter is not None:
+        if shutter is not None and shutter.is_rolling:
             standing = Camera.centred(moment.world_from_camera, 1.0, width_px=1, height_px=1)
             rates = body_rates(standing, shutter, scene.actors, moment.taken_ns)
 

@@ -5,6 +5,7 @@ those of the first with another package, in a pool of descriptors of their own: 
 alike.
 """
 
+import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -51,12 +52,8 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
     state = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(state, server)
     _add_reflection(server)
-    try:
-        bound = server.add_insecure_port(f"{host}:{port}")
-    except RuntimeError:
-        bound = 0
-    if bound == 0:
-        raise ConfigError(f"port {port} of {host} cannot be had: it is in use or not allowed")
+    _check_port(host, port)
+    bound = server.add_insecure_port(f"{host}:{port}")
     for name in ("", *service_names()):
         state.set(name, health_pb2.HealthCheckResponse.SERVING)
     server.start()
@@ -67,6 +64,16 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
         servicer.queue.close()
         server.stop(GRACE_S).wait(2 * GRACE_S)
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _check_port(host: str, port: int) -> None:
+    """Refuse a port that cannot be had; gRPC would write lines of its own about it."""
+    try:
+        socket.create_server((host, port)).close()
+    except OSError:
+        raise ConfigError(
+            f"port {port} of {host} cannot be had: it is in use or not allowed"
+        ) from None
 
 
 def described_services() -> Any:  # noqa: ANN401  upb has a pool of its own

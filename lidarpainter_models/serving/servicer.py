@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import torch
+
 import lidarpainter_models
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.kernels.side_by_side import side_by_side
@@ -86,6 +88,8 @@ class SensorsimServicer:
     """Ends the server when a client asks for it; None lets no client do that."""
     config: dict[str, str]
     """What the server was started with."""
+    device: torch.device | None = None
+    """Where scenes are drawn; None is a CPU."""
     is_painted: bool = False
     """Whether images lean on those that the same client asked for before."""
 
@@ -224,7 +228,7 @@ class SensorsimServicer:
         def draw(message: Any) -> _Made:  # noqa: ANN401
             return self._drawn(message, share, client)
 
-        return list(side_by_side(draw, messages))
+        return list(side_by_side(draw, messages, self.device))
 
     def _drawn(self, message: Any, share: int, client: str) -> _Made:  # noqa: ANN401
         begun, request, made = time.perf_counter(), None, _Made()

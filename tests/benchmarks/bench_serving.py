@@ -10,6 +10,7 @@ import argparse
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from math import radians
 from pathlib import Path
 
@@ -46,13 +47,13 @@ def main(*, is_quick):
     view = street.recording.views_of("front_camera")[2]
     request, served = read_request(street.request(view)), street.served
     unmeasured = replace(served, is_measured=False)
-    cases = {"trust alone": lambda: served.trust(request)}
-    cases["pinhole"] = lambda: unmeasured.frame(request)
+    cases = {"trust alone": partial(served.trust, request)}
+    cases["pinhole"] = partial(unmeasured.frame, request)
     for name, (lens, focal_px) in lenses(size[0]).items():
         matrix = (focal_px, 0.0, 0.0, focal_px)
         camera = replace(request.camera, lens=lens, pixels_per_unit=matrix)
         other = replace(request, camera=camera)
-        cases[name] = lambda other=other: unmeasured.frame(other)
+        cases[name] = partial(unmeasured.frame, other)
     for name, work in cases.items():
         work()
         taken_ms = 1e3 * best_cpu_s(work, 3 if is_quick else 7)

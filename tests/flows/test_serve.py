@@ -39,9 +39,9 @@ def server(tiny_run, tmp_path_factory):
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     addresses = [process.stdout.readline().strip() for _ in range(2)]
-    yield process, addresses, log
-    process.kill()
-    process.wait()
+    with process:
+        yield process, addresses, log
+        process.kill()
 
 
 def test_a_served_run_answers_as_render_and_ends_soon(tiny_run, server, tmp_path):
@@ -113,6 +113,12 @@ def request_of(image, actors):
 )
 def test_what_cannot_be_served_is_one_line(tiny_run, words, expected):
     assert expected in refuse("serve", "latest", *words, store=tiny_run.store)
+
+
+def test_a_missing_extra_is_one_line(tiny_run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    line = refuse("serve", "latest", "--port", "0", store=tiny_run.store)
+    assert "lidarpainter[simulators]" in line
 
 
 def test_a_port_that_is_taken_is_one_line(tiny_run):
