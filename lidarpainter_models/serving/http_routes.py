@@ -7,7 +7,6 @@ gone. The routes know one scene.
 
 import base64
 import io
-import math
 from dataclasses import dataclass, field, replace
 from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -219,7 +218,7 @@ def http_app(scene: HttpScene) -> "FastAPI":
 
     app.get("/alive")(lambda: True)
     first_ns = int(scene.served.recorded.frame_timestamps_ns[0])
-    app.get("/start_time")(lambda: math.ceil(first_ns / 1000))
+    app.get("/start_time")(lambda: first_ns // 1000)
     app.get("/get_actors")(scene.actors)
 
     @app.post("/update_actors")

@@ -25,7 +25,6 @@ from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.gaussians.model.actors import PRESENCE_MARGIN_NS
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
-from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.side_by_side import both
@@ -236,20 +235,13 @@ class ServedScene:
     def _faces(self, camera: SensorCamera, moment: Moment) -> Any:  # noqa: ANN401  a function
         """What draws a face of a lens at a moment."""
         scene, shutter = moment.scene, moment.shutter
-        poses = scene.actors.refined_poses(moment.taken_ns)
         rates = None
         if shutter is not None and shutter.is_rolling:
             standing = Camera.centred(moment.world_from_camera, 1.0, width_px=1, height_px=1)
             rates = body_rates(standing, shutter, scene.actors, moment.taken_ns)
 
         def draw(face: Face) -> Float[Tensor, "height width 3"]:
-            posed = PosedScene.of(
-                scene.actors,
-                scene.blinking,
-                face.at(moment.world_from_camera),
-                moment.taken_ns,
-                poses=poses,
-            )
+            posed = scene.posed(face.at(moment.world_from_camera), moment.taken_ns)
             if rates is not None and shutter is not None:
                 read_s = reading_times(camera, shutter.across_s, face.camera_from_face)
                 posed = ReadByLens.of_face(posed, rates, shutter, read_s)
