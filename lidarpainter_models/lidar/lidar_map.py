@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lidarpainter_models.devices import on_device
+from lidarpainter_models.scenes.tracks import remembered
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +119,9 @@ class LidarMap:
 
     def newest_age_ns(self, timestamp_ns: int) -> int:
         """How far in time the nearest street point is; kept, as many views share a time."""
-        if timestamp_ns not in self._newest_age_ns:
+
+        def newest() -> int:
             age_ns = (self.street.timestamp_ns - timestamp_ns).abs()
-            self._newest_age_ns[timestamp_ns] = int(age_ns.min()) if len(age_ns) else 0
-        return self._newest_age_ns[timestamp_ns]
+            return int(age_ns.min()) if len(age_ns) else 0
+
+        return remembered(self._newest_age_ns, timestamp_ns, newest)

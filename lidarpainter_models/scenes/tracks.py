@@ -3,8 +3,9 @@
 Box frame: x along the length, y to the left, z up, origin at the centre.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,6 +25,21 @@ behind something for a moment is still there."""
 
 MOVING_M = 1.0
 """An actor that gets so far from its first box moves; a parked car's boxes jitter by less."""
+
+
+MOST_TIMES = 10_000
+"""At which poses are kept: all of a log, and not all that a simulator asks for in days."""
+Made = TypeVar("Made")
+
+
+def remembered(known: dict[int, Made], timestamp_ns: int, make: Callable[[], Made]) -> Made:
+    """What is known of a time, or what is made of it; several threads may ask."""
+    found = known.get(timestamp_ns)
+    if found is None:
+        if len(known) >= MOST_TIMES:
+            known.clear()
+        found = known[timestamp_ns] = make()
+    return found
 
 
 def does_move(centres_m: Float[Tensor, "times 3"]) -> bool:
@@ -148,10 +164,10 @@ class TrackPoses:
 
     def all_at(self, timestamp_ns: int) -> Float[Tensor, "tracks 4 4"]:
         """Poses of all tracks at one time; not to be changed."""
-        if timestamp_ns not in self._at:
-            rows = torch.arange(len(self))
-            self._at[timestamp_ns] = self.at(rows, torch.full_like(rows, timestamp_ns))
-        return self._at[timestamp_ns]
+        rows = torch.arange(len(self))
+        return remembered(
+            self._at, timestamp_ns, lambda: self.at(rows, torch.full_like(rows, timestamp_ns))
+        )
 
 
 def tracks_from_boxes(

@@ -5,7 +5,14 @@ import pytest
 import torch
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses, does_move, tracks_from_boxes
+from lidarpainter_models.scenes.tracks import (
+    MOST_TIMES,
+    ActorTrack,
+    TrackPoses,
+    does_move,
+    remembered,
+    tracks_from_boxes,
+)
 
 
 def track(actor_id, times_ns):
@@ -112,3 +119,11 @@ def test_who_gets_a_metre_from_its_first_box_moves(along_m, moves):
     centres_m = torch.zeros(len(along_m), 3, dtype=torch.float64)
     centres_m[:, 1] = torch.tensor(along_m, dtype=torch.float64)
     assert does_move(centres_m) is moves
+
+
+def test_what_is_remembered_of_times_does_not_grow_for_ever():
+    known = {}
+    for time_ns in range(3 * MOST_TIMES):
+        assert remembered(known, time_ns, lambda time_ns=time_ns: time_ns + 1) == time_ns + 1
+        assert len(known) <= MOST_TIMES
+    assert remembered(known, 3 * MOST_TIMES - 1, lambda: None) == 3 * MOST_TIMES

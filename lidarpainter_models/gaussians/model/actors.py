@@ -16,7 +16,7 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.bending import Bending, knots_around
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses, remembered
 
 PRESENCE_MARGIN_NS = 60_000_000
 """An actor stays for half a 10 Hz frame (and a little) beyond its first and last box."""
@@ -114,14 +114,15 @@ class Actors:
         At training times they are those of `refined_poses_in_fit`; in between see `pose_blending`.
         """
         recorded, present = self.recorded_poses(timestamp_ns)
-        known = self._motions().refined_at
-        if timestamp_ns not in known:
+
+        def refined() -> Float[Tensor, "actors 4 4"]:
             actors = present.nonzero()[:, 0]
             poses = recorded.clone()
             times_ns = torch.full_like(actors, timestamp_ns)
             poses[actors] = self._refined_at(actors, times_ns, recorded[actors])
-            known[timestamp_ns] = poses
-        return known[timestamp_ns], present
+            return poses
+
+        return remembered(self._motions().refined_at, timestamp_ns, refined), present
 
     def refined_tracks(self) -> tuple[ActorTrack, ...]:
         """The tracks with refined poses at their own times."""
@@ -144,11 +145,13 @@ class Actors:
 
     def recorded_poses(self, timestamp_ns: int) -> ActorPoses:
         """Poses at a time as they were recorded."""
-        if timestamp_ns not in self._recorded_at:
+
+        def recorded() -> ActorPoses:
             poses = self._recorded.all_at(timestamp_ns)
             present = self._recorded.present(timestamp_ns, PRESENCE_MARGIN_NS)
-            self._recorded_at[timestamp_ns] = (poses, present.double())
-        return self._recorded_at[timestamp_ns]
+            return poses, present.double()
+
+        return remembered(self._recorded_at, timestamp_ns, recorded)
 
     @cached_property
     def _present_at_knots(self) -> Bool[Tensor, "actors knots"]:
