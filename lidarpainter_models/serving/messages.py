@@ -32,6 +32,8 @@ FARTHEST_M = 1e6
 """From the origin of the scene; float32 has centimetres there."""
 LENGTH_TOLERANCE = 0.01
 """By which a quaternion may depart from unit length."""
+MOST_SEARCHED = 2**21
+"""Pixels through a distorted pinhole or behind a windshield: 1920 x 1080 is within, and seconds."""
 LONGEST_S = 1.0
 """Of a readout."""
 _ACROSS = {
@@ -121,6 +123,12 @@ def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRe
         raise invalid(
             f"{len(message.dynamic_objects)} dynamic_objects: expected at most {MOST_ACTORS}"
         )
+    camera = sensor_camera(spec).resized(width_px, height_px)
+    if camera.is_searched and width_px * height_px > MOST_SEARCHED:
+        raise invalid(
+            f"the request has {width_px} x {height_px} px through a lens whose rays are searched "
+            f"for: expected at most {MOST_SEARCHED} px"
+        )
     ids = tuple(one.track_id for one in message.dynamic_objects)
     pairs = [(f"dynamic object {one.track_id!r}", one.pose_pair) for one in message.dynamic_objects]
     poses = _poses([("sensor_pose", message.sensor_pose), *pairs])
@@ -128,7 +136,7 @@ def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRe
     return SensorRequest(
         scene_id=message.scene_id,
         camera_name=name,
-        camera=sensor_camera(spec).resized(width_px, height_px),
+        camera=camera,
         start_us=start_us,
         end_us=end_us,
         across=_ACROSS[spec.shutter_type],

@@ -25,7 +25,7 @@ from lidarpainter_models.geometry.cameras import Camera
 
 SAMPLES = 2048
 """Places at which a curve is looked at, to find how far it rises and where Newton begins."""
-STEPS = 12
+STEPS = 8
 """Of Newton's method at most; from a good start it comes to rest after five."""
 AT_REST = 1e-11
 """Moves that are no longer worth a step."""
@@ -92,20 +92,21 @@ def newton(
     function: Plane, wanted: Float[Tensor, "*points 2"], start: Float[Tensor, "*points 2"]
 ) -> Float[Tensor, "*points 2"]:
     """Where a function of the plane takes the wanted values, by Newton's method from a start."""
-    found = start
+    found, wanted = start.reshape(-1, 2).clone(), wanted.reshape(-1, 2)
     steps = torch.eye(2, dtype=start.dtype, device=start.device) * STEP
+    moving = torch.arange(len(found), device=start.device)
     for _ in range(STEPS):
-        value = function(found)
-        (a, c), (b, d) = (((function(found + step) - value) / STEP).unbind(-1) for step in steps)
+        place = found[moving]
+        value = function(place)
+        (a, c), (b, d) = (((function(place + step) - value) / STEP).unbind(-1) for step in steps)
         determinant = a * d - b * c
         safe = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
-        x, y = (wanted - value).unbind(-1)
+        x, y = (wanted[moving] - value).unbind(-1)
         move = torch.stack([d * x - b * y, a * y - c * x], dim=-1) / safe[..., None]
         move = move.nan_to_num().clamp(-1, 1)
-        found = found + move
-        if not bool((move.abs() > AT_REST).any()):
-            break
-    return found
+        found[moving] = place + move
+        moving = moving[(move.abs() > AT_REST).any(dim=-1)]
+    return found.reshape(start.shape)
 
 
 @dataclass(frozen=True)
@@ -287,6 +288,12 @@ class SensorCamera:
             width_px=width_px,
             height_px=height_px,
         )
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether every ray is searched for: there is no formula for it."""
+        bends = isinstance(self.lens, PinholeLens) and not self.lens.is_plain
+        return bends or self.windshield is not None
 
     def pinhole_at(self, world_from_camera: Float[Tensor, "4 4"]) -> Camera | None:
         """The same as a pinhole without distortion; None if it is none."""

@@ -144,3 +144,16 @@ def test_a_smaller_image_sees_the_same():
     small = PINHOLE.resized(48, 27)
     points = torch.from_numpy(directions(0.3))
     assert torch.allclose(small.project(points) * 2, PINHOLE.project(points))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_places_of_points_have_their_slope(name):
+    """By which a rolling shutter stretches what it reads."""
+    camera = CAMERAS[name]
+    points = torch.tensor([[0.4, -0.2, 2.0], [-0.1, 0.3, 1.0]], dtype=torch.float64)
+    points.requires_grad_()
+    (slope,) = torch.autograd.grad(camera.project(points).sum(), points)
+    step = 1e-5 * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    with torch.no_grad():
+        apart = camera.project(points + step) - camera.project(points - step)
+    assert torch.allclose(slope[:, 0], apart.sum(dim=1) / 2e-5, rtol=1e-4)
