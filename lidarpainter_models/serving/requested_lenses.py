@@ -31,26 +31,29 @@ def checked_size(message: Any, spec: Any) -> tuple[int, int]:  # noqa: ANN401  m
         RequestError: INVALID_ARGUMENT, where there is no size, too large a one, or another shape.
     """
     full = (spec.resolution_w, spec.resolution_h)
-    asked = (message.resolution_w, message.resolution_h)
-    for what, size in (("camera_intrinsics", full), ("the request", asked)):
-        if max(size) > MOST_SIDE_PX or size[0] * size[1] > MOST_PIXELS:
-            raise invalid(
-                f"{what} has {size[0]} x {size[1]} px: expected at most {MOST_SIDE_PX} px a side "
-                f"and {MOST_PIXELS} px"
-            )
     if min(full) == 0:
         raise invalid(f"camera_intrinsics has {full[0]} x {full[1]} px: expected the lens' size")
-    width_px, height_px = asked
+    _check_pixels("camera_intrinsics", full)
+    width_px, height_px = message.resolution_w, message.resolution_h
     if width_px == 0 and height_px == 0:
         return full
     width_px = width_px or max(round(height_px * full[0] / full[1]), 1)
     height_px = height_px or max(round(width_px * full[1] / full[0]), 1)
+    _check_pixels("the request", (width_px, height_px))
     if abs(width_px * full[1] - height_px * full[0]) > max(full):
         raise invalid(
             f"the request has {width_px} x {height_px} px, its lens {full[0]} x {full[1]} px: "
             "expected the same proportions, the image is scaled and not cut"
         )
     return width_px, height_px
+
+
+def _check_pixels(what: str, size: tuple[int, int]) -> None:
+    if max(size) > MOST_SIDE_PX or size[0] * size[1] > MOST_PIXELS:
+        raise invalid(
+            f"{what} has {size[0]} x {size[1]} px: expected at most {MOST_SIDE_PX} px a side and "
+            f"{MOST_PIXELS} px"
+        )
 
 
 def sensor_camera(spec: Any) -> SensorCamera:  # noqa: ANN401  a CameraSpec
