@@ -50,6 +50,8 @@ SAME_TIME_NS = 1_500
 """Up to which a request is of a recorded moment: messages count in microseconds."""
 MOST_RAYS = 2**24
 """Of lenses that are kept: of a rig of six cameras at 1920 x 1080."""
+LEAST_PX = 8
+"""A side of the image that trust is measured on: of one pixel there is nothing to compare."""
 MIDDLE_TANGENT = 1.4
 """Of the part of a wide lens that its trust is measured on: 109 degrees across."""
 
@@ -266,12 +268,14 @@ class ServedScene:
         """A pinhole that sees what an image shows, or the middle part of it."""
         pinhole = request.camera.pinhole_at(moment.world_from_camera)
         if pinhole is not None:
-            return moment.recorded or replace(pinhole, shutter=moment.shutter)
+            camera = moment.recorded or replace(pinhole, shutter=moment.shutter)
+            size = {"width_px": camera.width_px, "height_px": camera.height_px}
+            return camera.resized(**{name: max(px, LEAST_PX) for name, px in size.items()})
         rays = self.lens(request.camera).rays[::8, ::8].reshape(-1, 3)
         ahead = rays[rays[:, 2] > 0.1]
         reach = (ahead[:, :2] / ahead[:, 2:]).abs().amax(dim=0).clamp(max=MIDDLE_TANGENT)
         focal_px = EVIDENCE_WIDTH_PX / 2 / max(float(reach[0]), 0.05)
-        height_px = max(round(2 * focal_px * float(reach[1])), 8)
+        height_px = max(round(2 * focal_px * float(reach[1])), LEAST_PX)
         return Camera.centred(
             moment.world_from_camera, focal_px, width_px=EVIDENCE_WIDTH_PX, height_px=height_px
         )

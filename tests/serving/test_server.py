@@ -161,6 +161,7 @@ def test_every_refusal_has_its_code(street, client, view):
         (late, "OUT_OF_RANGE", "was recorded from"),
         (stranger, "INVALID_ARGUMENT", "'nobody'"),
         (squeezed, "INVALID_ARGUMENT", "proportions"),
+        (changed(resolution_w=0, resolution_h=8192), "INVALID_ARGUMENT", "14564 x 8192"),
         (backwards, "INVALID_ARGUMENT", "before"),
         (film, "INVALID_ARGUMENT", "AVC"),
     ]
