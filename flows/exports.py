@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from catalog.store import Store
-from flows.views import viewed_run
+from flows.views import envelope_of, viewed_run
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.formats import ExportFormat, export_format
 from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
 from tasks.exports.dataset import export_dataset
 from tasks.exports.scene import SceneRequest, export_scene
+from tasks.exports.simulator import export_bundle
 from tasks.exports.sweeps import export_sweeps
 from tasks.exports.views import export_images, export_video
 from tasks.runs import FinishedRun, lineage, open_run
@@ -72,6 +73,8 @@ def _export(
             return export_dataset(viewed, request, row, out)
         case "page":
             return write_page(viewed, request, out)
+        case "bundle":
+            return export_bundle(viewed.run, finished, envelope_of(store, finished), row, out)
         case "views":
             kinds = ViewKinds(
                 images=False,

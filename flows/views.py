@@ -93,8 +93,13 @@ def viewed_run(store: Store, finished: FinishedRun, request: ViewRequest) -> Vie
 
 def _calibration(store: Store, finished: FinishedRun) -> Calibration:
     """As the envelope of the run says, or of the nearest one that it was changed from."""
+    return calibration_of(envelope_of(store, finished))
+
+
+def envelope_of(store: Store, finished: FinishedRun) -> dict[str, Any] | None:
+    """How far a run can be trusted, or the nearest that it was changed from; None if unasked."""
     envelopes = (run.result.get(ENVELOPE) for run in lineage(store, finished))
-    return calibration_of(next((found for found in envelopes if found), None))
+    return next((found for found in envelopes if found), None)
 
 
 def _beside(store: Store, finished: FinishedRun, beside: str | None) -> FittedRef | None:

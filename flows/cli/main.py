@@ -19,6 +19,7 @@ from catalog.errors import CatalogError
 from catalog.store import DEFAULT_STORE, STORE_ENVIRONMENT
 from flows.cli import (
     assets,
+    bundle,
     catalog,
     demo,
     doctor,
@@ -94,6 +95,7 @@ app.command("reconstruct")(reconstruct.reconstruct)
 app.command("settings")(settings.settings)
 app.command("render")(render.render)
 app.command("export")(export.export)
+app.command("check-bundle")(bundle.check_bundle)
 app.command("stylize")(stylize.stylize)
 app.command("edit")(edit.edit)
 app.command("view")(view.view)

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from lidarpainter_models.errors import ConfigError
 
-FormatKind = Literal["scene", "dataset", "views", "page", "sweeps"]
+FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "bundle"]
 """What a format holds: the fitted scene, recorded images with poses, views along a trajectory, a
-page that plays the drive, or recorded LiDAR sweeps."""
+page that plays the drive, recorded LiDAR sweeps, or all that a simulator loads."""
 
 _WHERE = ("--trajectory", "--camera", "--frames", "--width")
 _WHEN = ("--time", "--actors", "--sky")
@@ -160,6 +160,14 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="recorded LiDAR sweeps as nuScenes' .pcd.bin",
         writer=f"{_HERE}.lidar_files:write_pcd_bin",
         options=("--frames",),
+    ),
+    ExportFormat(
+        name="simulator",
+        kind="bundle",
+        summary="scene, rig, tracks, meshes and map in the .usdz that driving simulators load",
+        writer=f"{_HERE}.simulator_bundle:write_bundle",
+        endings=(".usdz",),
+        options=(),
     ),
 )
 FORMAT_NAMES = tuple(row.name for row in FORMATS)

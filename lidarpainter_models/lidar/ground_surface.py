@@ -8,7 +8,7 @@ wide as the LiDAR leaves between its rings, and under the recording car, which h
 it drives on.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,6 +72,10 @@ class GroundSurface:
         found = np.where(along > across, lower, upper)
         is_outside = (np.minimum(along, across) < 0) | (np.maximum(along, across) > 1)
         return np.where(is_outside, np.nan, found)
+
+    def everywhere(self) -> "GroundSurface":
+        """The same with every unknown height as that of the nearest known one."""
+        return replace(self, height_m=_nearest_filled(self.height_m))
 
     def mesh(self) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
         """Vertices (world, float32) and triangles, counter-clockwise from above."""

@@ -172,17 +172,14 @@ def marking_points(
         for number, name in scene.semantic_classes.items()
         if "lane" in name.lower() and "mark" in name.lower()
     ]
-    wanted = set(frames)
-    if named and scene.read_semantics(scene.swept_frames[0]) is not None:
-        marked = [
-            scene.read_positions(frame)[
-                torch.isin(scene.read_semantics(frame), torch.tensor(named))
-            ]
-            for frame in scene.swept_frames
-            if frame in wanted
-        ]
-        return torch.cat([torch.zeros(0, 3), *marked])[:, :2].double().numpy()
-    found = [np.zeros((0, 2))]
+    wanted, found = set(frames), [np.zeros((0, 2))]
+    for frame in scene.swept_frames if named else ():
+        classes = scene.read_semantics(frame) if frame in wanted else None
+        if classes is not None:
+            is_marked = torch.isin(classes, torch.tensor(named))
+            found.append(scene.read_positions(frame)[is_marked, :2].double().numpy())
+    if len(found) > 1:
+        return np.concatenate(found)
     for sweep in scene.sweeps:  # two LiDARs see the same paint with different strength
         if sweep.frame_index in wanted:
             points = scene.read_sweep(sweep)
