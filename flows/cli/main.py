@@ -23,6 +23,7 @@ from flows.cli import (
     catalog,
     demo,
     doctor,
+    drive,
     edit,
     evaluate,
     export,
@@ -95,6 +96,7 @@ app.command("reconstruct")(reconstruct.reconstruct)
 app.command("settings")(settings.settings)
 app.command("render")(render.render)
 app.command("export")(export.export)
+app.command("drive")(drive.drive)
 app.command("check-bundle")(bundle.check_bundle)
 app.command("stylize")(stylize.stylize)
 app.command("edit")(edit.edit)

@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -56,14 +57,19 @@ class BundleContents:
     run_id: str
     software: str
     scene: GaussianScene
-    recorded: DrivingScene
-    """Where its sweeps say that it was (`DrivingScene.corrected`)."""
+    log: DrivingScene
+    """As it was recorded."""
     gaussians: SceneContents
     surroundings: Surroundings
     envelope: Mapping[str, Any] | None
     """How far the scene can be trusted (`evaluation/envelope.py`); None where nobody asked."""
     figures: Mapping[str, float]
     """What else the run is judged by."""
+
+    @cached_property
+    def recorded(self) -> DrivingScene:
+        """The log where its sweeps say that it was."""
+        return self.log.corrected(self.scene.cameras.path)
 
     @property
     def name(self) -> str:
@@ -217,7 +223,7 @@ def _calibration(contents: BundleContents, name: str, number: int) -> dict[str, 
         "sequence_id": contents.name,
         "logical_sensor_name": name,
         "unique_sensor_idx": number,
-        "T_sensor_rig": rig_from_camera(contents.scene, contents.recorded, name).tolist(),
+        "T_sensor_rig": rig_from_camera(contents.scene, contents.log, name).tolist(),
         "camera_model": {
             "type": "opencv-pinhole",
             "parameters": {
@@ -234,19 +240,20 @@ def _calibration(contents: BundleContents, name: str, number: int) -> dict[str, 
 
 
 def rig_from_camera(
-    scene: GaussianScene, recorded: DrivingScene, camera_name: str
+    scene: GaussianScene, log: DrivingScene, camera_name: str
 ) -> Float[Tensor, "4 4"]:
     """Where a camera sits on the car (float64): as in the image in the middle of the log.
 
     Args:
-        scene: which refines the camera's pose.
-        recorded: the log, where its sweeps say that it was (`DrivingScene.corrected`).
+        scene: which refines the poses of cameras and of the car.
+        log: as it was recorded.
         camera_name: a camera of the log.
     """
-    views = sorted(recorded.views_of(camera_name), key=lambda view: view.timestamp_ns)
+    views = log.views_of(camera_name)
     view = views[len(views) // 2]
-    camera = found_camera(scene, recorded, view, view.camera)
-    rig = driven_road(recorded).driven_on(torch.tensor([view.timestamp_ns])).world_from_body[0]
+    camera = found_camera(scene, log, view, view.camera)
+    driven = driven_road(log.corrected(scene.cameras.path))
+    rig = driven.driven_on(torch.tensor([view.timestamp_ns])).world_from_body[0]
     return invert_rigid(rig) @ camera.world_from_camera.double()
 
 

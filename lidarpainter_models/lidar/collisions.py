@@ -117,26 +117,72 @@ def points_inside(
     return counts.index_add(0, moments[is_inside], torch.ones(int(is_inside.sum())).long())
 
 
+def clearances_m(body: MovingBody, tracks: Sequence[ActorTrack]) -> Float[Tensor, "tracks moments"]:
+    """How far each actor's box is from the body, seen from above.
+
+    0 where they overlap, infinite where the actor is not there.
+    """
+    own, theirs, present = _seen_from_above(body, tracks)
+    between = torch.minimum(_to_edges(own, theirs), _to_edges(theirs, own))
+    between[~_apart(own, theirs)] = 0.0
+    between[~present] = torch.inf
+    return between
+
+
 def _touched(body: MovingBody, tracks: Sequence[ActorTrack]) -> Bool[Tensor, "tracks moments"]:
     """Whether each actor's box and the body overlap, by separating axes of their outlines."""
-    poses = TrackPoses.of(tracks)
-    times_ns = body.timestamps_ns
-    num_moments = len(times_ns)
-    rows = torch.arange(len(tracks)).repeat_interleave(num_moments)
-    others = poses.at(rows, times_ns.repeat(len(tracks))).unflatten(0, (len(tracks), num_moments))
-    present = poses.present(times_ns[:, None]).T
-    sizes_m = torch.stack([track.size_m for track in tracks]).double() if tracks else None
-    if sizes_m is None:
-        return present
+    own, theirs, present = _seen_from_above(body, tracks)
+    heights_m = torch.tensor([float(track.size_m[2]) for track in tracks], dtype=torch.float64)
+    half_m = (body.size_m[2] + heights_m[:, None]) / 2
+    above = (_poses(body, tracks)[..., 2, 3] - body.world_from_box[:, 2, 3]).abs() > half_m
+    return present & ~_apart(own, theirs) & ~above
+
+
+def _seen_from_above(
+    body: MovingBody, tracks: Sequence[ActorTrack]
+) -> tuple[
+    Float[Tensor, "tracks moments 4 2"],
+    Float[Tensor, "tracks moments 4 2"],
+    Bool[Tensor, "tracks moments"],
+]:
+    """Corners of the body and of each actor at every moment, and whether the actor is there."""
+    present = TrackPoses.of(tracks).present(body.timestamps_ns[:, None]).T
+    sizes_m = torch.stack([torch.zeros(3), *(track.size_m for track in tracks)])[1:].double()
     own = _outline(body.world_from_box.double(), body.size_m.double())
-    theirs = _outline(others, sizes_m[:, None])
-    axes = torch.cat([_sides(own).expand(len(tracks), -1, -1, -1), _sides(theirs)], dim=2)
-    ours_m = torch.einsum("mcx,tmax->tmac", own, axes)
+    return (
+        own.expand(len(tracks), -1, -1, -1),
+        _outline(_poses(body, tracks), sizes_m[:, None]),
+        present,
+    )
+
+
+def _poses(body: MovingBody, tracks: Sequence[ActorTrack]) -> Float[Tensor, "tracks moments 4 4"]:
+    """Where each actor is at the moments of the body."""
+    times_ns = body.timestamps_ns
+    rows = torch.arange(len(tracks)).repeat_interleave(len(times_ns))
+    poses = TrackPoses.of(tracks).at(rows, times_ns.repeat(len(tracks)))
+    return poses.reshape(len(tracks), len(times_ns), 4, 4)
+
+
+def _apart(
+    own: Float[Tensor, "tracks moments 4 2"], theirs: Float[Tensor, "tracks moments 4 2"]
+) -> Bool[Tensor, "tracks moments"]:
+    """Whether a line can be laid between two outlines."""
+    axes = torch.cat([_sides(own), _sides(theirs)], dim=2)
+    ours_m = torch.einsum("tmcx,tmax->tmac", own, axes)
     theirs_m = torch.einsum("tmcx,tmax->tmac", theirs, axes)
     apart = (ours_m.amax(-1) < theirs_m.amin(-1)) | (theirs_m.amax(-1) < ours_m.amin(-1))
-    half_m = (body.size_m[2] + sizes_m[:, 2:]) / 2
-    above = (others[..., 2, 3] - body.world_from_box[:, 2, 3]).abs() > half_m
-    return present & ~apart.any(dim=-1) & ~above
+    return apart.any(dim=-1)
+
+
+def _to_edges(
+    corners: Float[Tensor, "tracks moments 4 2"], outline: Float[Tensor, "tracks moments 4 2"]
+) -> Float[Tensor, "tracks moments"]:
+    """The least distance from the corners of one outline to the edges of another."""
+    start, edge = outline[..., None, :, :], (outline.roll(-1, 2) - outline)[..., None, :, :]
+    away = corners[..., :, None, :] - start
+    share = ((away * edge).sum(-1) / edge.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
+    return (away - share[..., None] * edge).norm(dim=-1).flatten(2).amin(-1)
 
 
 def _outline(

@@ -70,7 +70,7 @@ def export_bundle(
         run_id=finished.run_id,
         software=f"lidarpainter {lidarpainter_models.__version__}",
         scene=street.scene,
-        recorded=street.recorded,
+        log=opened(run).scene,
         gaussians=scene_contents(street.scene.baked(times_ns[0]), finished.scene_id, times_ns),
         surroundings=street.surroundings,
         envelope=envelope,
