@@ -45,6 +45,9 @@ RANGE_BIN_M, MOST_RANGE_M = 3.0, 30.0
 LEVEL_M = 0.1
 """What rises by more within the width of a lane is no road to drive on, but a kerb."""
 
+MOST_FALL = 0.04
+"""A road falls to its edge by so much of the way to it."""
+
 Mark = Literal["solid", "broken", "none"]
 
 
@@ -73,8 +76,8 @@ class RoadLine:
         return cKDTree(self.xy_m)
 
     def place(
-        self, s_m: Float[np.ndarray, "*places"], d_m: Float[np.ndarray, "*places"] | float
-    ) -> Float[np.ndarray, "*places 2"]:
+        self, s_m: Float[np.ndarray, "*#places"], d_m: Float[np.ndarray, "*#places"] | float
+    ) -> Float[np.ndarray, "... 2"]:
         """World x and y of road coordinates."""
         x, y, u, v = (np.interp(s_m, self.s_m, column) for column in (*self.xy_m.T, *self.ahead.T))
         norm = np.hypot(u, v)
@@ -307,7 +310,8 @@ def _assumed_road(line: RoadLine, ground: GroundSurface, trusted_m: tuple[float,
     for side, reach_m in zip((1, -1), trusted_m, strict=True):
         places = line.place(line.s_m[:, None], side * aside[None])
         rise_m = np.abs(ground.at(places) - ground.at(line.place(line.s_m, 0.0))[:, None])
-        is_level = np.nanmedian(rise_m - 0.04 * aside, axis=0) < LEVEL_M  # a road falls to its edge
+        rise_m = np.nan_to_num(rise_m, nan=np.inf)
+        is_level = np.median(rise_m - MOST_FALL * aside, axis=0) < LEVEL_M
         free = len(aside) if is_level.all() else int(is_level.argmin())
         edge = half + min(free * BIN_M, reach_m)
         if edge - half > 0.3:
