@@ -8,13 +8,16 @@ dataset itself calls road or ground; a hole is where such a point has no mesh be
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import open3d
 from scipy.spatial import cKDTree
 
-from lidarpainter_models.lidar.ground_surface import GroundSurface, ground_surface
-from lidarpainter_models.lidar.map_building import gather_points
-from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
+from lidarpainter_models.export.meshes import obstacle_mesh
+from lidarpainter_models.lidar.ground_surface import GroundSurface
+from lidarpainter_models.lidar.surroundings import Surroundings, surroundings_of
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 HELD_OUT = 10
 """Every n-th sweep is held out."""
@@ -23,10 +26,13 @@ LANES_M = 5.25
 """The driven lane and those beside it reach so far to both sides of the path."""
 
 
-def held_out_ground(scene: DrivingScene, frames: list[int]) -> np.ndarray:
-    """Points (world) of some frames that the dataset itself calls ground."""
+STANDING_CLASSES = ("Building", "Signs", "Other Static", "Vegetation", "Pylons", "Road Barriers")
+
+
+def points_called(scene: DrivingScene, frames: list[int], called: tuple[str, ...]) -> np.ndarray:
+    """Points (world) of some frames whose class, by the dataset itself, begins so."""
     names = scene.semantic_classes.items()
-    wanted = [number for number, name in names if name.startswith(GROUND_CLASSES)]
+    wanted = [number for number, name in names if name.startswith(called)]
     found = []
     for frame in frames:
         classes = scene.read_semantics(frame)
@@ -69,20 +75,40 @@ def say(name: str, surface: GroundSurface, points_m: np.ndarray) -> None:
     )
 
 
+def say_obstacles(around: Surroundings, points_m: np.ndarray) -> None:
+    """One line about how far the collision mesh is from held-out points that stand on the ground."""
+    made_of = around.obstacle_points()
+    vertices, faces = obstacle_mesh(made_of, np.array([0.0, 0.0, 2.0]))
+    tensor: Any = open3d.core.Tensor
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(tensor(vertices), tensor(faces.astype(np.uint32)))
+    low, high = made_of.min(axis=0) + 2, made_of.max(axis=0) - 2
+    height_m = points_m[:, 2] - around.ground.everywhere().at(points_m[:, :2])
+    is_in = ((points_m[:, :2] > low[:2]) & (points_m[:, :2] < high[:2])).all(axis=1)
+    judged = points_m[is_in & (height_m > 0.25) & (height_m < 5.5)][::5]
+    away_m = scene.compute_distance(tensor(judged.astype(np.float32))).numpy()
+    middle, most = np.quantile(away_m, (0.5, 0.95))
+    sys.stdout.write(
+        f"obstacles: {len(faces)} faces, {len(judged)} held-out points, median "
+        f"{100 * middle:.1f} cm, mean {100 * away_m.mean():.1f} cm, "
+        f"95th percentile {100 * most:.1f} cm\n"
+    )
+
+
 def main(folder: str) -> None:
     """Print how far the meshes are from what was held out."""
     scene = DrivingScene.open(Path(folder))
     held = scene.swept_frames[HELD_OUT // 2 :: HELD_OUT]
     used = [frame for frame in scene.swept_frames if frame not in held]
-    street = gather_points(scene, used).street
-    path = scene.world_from_ego[:, :3, 3].numpy()
-    surface = ground_surface(street, driven_road(scene))
-    points_m = held_out_ground(scene, held)
+    around = surroundings_of(scene, used, trusted_m=(0.0, 0.0))
+    path, surface = scene.world_from_ego[:, :3, 3].numpy(), around.ground
+    points_m = points_called(scene, held, GROUND_CLASSES)
     aside = aside_m(points_m[:, :2], path[:, :2])
     sys.stdout.write(f"{len(used)} frames make the mesh, {len(held)} are held out\n")
     say("driven lane and those beside it", surface, points_m[aside < LANES_M])
     near = points_m[(aside >= LANES_M) & (aside < 20)]
     say("farther, up to 20 m", surface, near)
+    say_obstacles(around, points_called(scene, held, STANDING_CLASSES))
 
 
 if __name__ == "__main__":

@@ -41,8 +41,8 @@ METADATA = (
     *("scene_id", "version_string", "training_date", "dataset_hash", "uuid", "is_resumable"),
     *("sensors", "logger", "time_range", "training_step_outputs"),
 )
-NEAR_PATH_M, MOST_GAP_M = 2.0, 0.3
-"""A hole of the ground so wide, so near to the path, stops a simulated car."""
+NEAR_PATH_M, MOST_GAP_M = 1.75, 0.3
+"""A hole of the ground so wide, on the lane that was driven, stops a simulated car."""
 MOST_PLACES = 100
 """Places of the path around which holes are looked for."""
 LOOKED_FROM_M = 3.0
@@ -161,8 +161,16 @@ def _metadata(bundle: OpenedBundle) -> Lines:
     if not isinstance(outputs, dict) or not any("envelope" in str(key) for key in outputs):
         yield "warn", "says nothing of how far from its path the scene can be trusted"
     else:
-        left, right = (outputs.get(f"envelope_{side}_m") for side in ("left", "right"))
-        yield "ok", f"trusted {left} m to the left and {right} m to the right of its path"
+        yield _trusted(outputs)
+
+
+def _trusted(outputs: dict[str, Any]) -> tuple[Verdict, str]:
+    """What an envelope of ours says of the whole path."""
+    sides = ("left", "right")
+    reach = numbers([outputs.get(f"envelope_{side}_m", -1) for side in sides], "envelope", 2)
+    if reach.min() < 0:
+        return "warn", "not trusted on all of its own path: see envelope_000_confidence and on"
+    return "ok", f"trusted {reach[0]:g} m to the left and {reach[1]:g} m to the right of its path"
 
 
 def _rig(bundle: OpenedBundle) -> Lines:

@@ -1,8 +1,8 @@
 """Triangle meshes of the street for simulators: files, and obstacles from LiDAR points.
 
 World frame, z up, metres. Of three ways to a mesh that open3d has, ball pivoting (Bernardini et
-al., 1999) is taken, by `scripts/measure_ground_mesh.py`: it is as near to held-out points as the
-others and, unlike a Poisson surface, nowhere far from what was measured.
+al., 1999) is taken: measured on a log (docs/bundle.md) it is as near to held-out points as the
+others and, unlike a Poisson surface, nowhere far from what was seen.
 """
 
 import re
