@@ -76,7 +76,7 @@ def say(name: str, surface: GroundSurface, points_m: np.ndarray) -> None:
 
 
 def say_obstacles(around: Surroundings, points_m: np.ndarray) -> None:
-    """One line about how far the collision mesh is from held-out points that stand on the ground."""
+    """One line about how far the collision mesh is from held-out points on what stands."""
     made_of = around.obstacle_points()
     vertices, faces = obstacle_mesh(made_of, np.array([0.0, 0.0, 2.0]))
     tensor: Any = open3d.core.Tensor

@@ -24,6 +24,7 @@ from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.trust import KEYS
 from lidarpainter_models.serving.wire import MOST_BYTES, client, grpc_package
 
+MOST_CAMERAS, MOST_PX = 64, 100_000
 CONNECT_S, CALL_S = 20.0, 300.0
 """How long a renderer may take to be there, and to answer: the first image loads the scene."""
 
@@ -89,12 +90,15 @@ class SensorClient:
             reply, call = self.calls.batch_render_rgb.with_call(batch, timeout=CALL_S)
         said = dict(call.trailing_metadata() or ()).get(KEYS[0], "").split(",")
         confidences = [_number(word) for word in said] if len(said) == len(names) else []
-        return {
+        found = {
             item.camera_name: SeenFrame(
                 rgb_u8=_decoded(item), confidence=confidences[row] if confidences else None
             )
             for row, item in enumerate(reply.items)
         }
+        if set(found) != set(names):
+            raise DataError(f"{self.scene_id}: {len(found)} images of {len(names)} that were asked")
+        return found
 
 
 @contextmanager
@@ -124,13 +128,15 @@ def connected(address: str, wanted: tuple[str, ...], *, width_px: int) -> Iterat
                 raise DataError(f"{address} has no scene {wanted[0]}, it has {there}")
             asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)
             found = calls.get_available_cameras(asked, timeout=CALL_S).available_cameras
-        if not found:
-            raise DataError(f"{address} has no cameras for {scene_id}")
+        if not 0 < len(found) <= MOST_CAMERAS:
+            raise DataError(
+                f"{address} has {len(found)} cameras for {scene_id}, expected 1 to {MOST_CAMERAS}"
+            )
         yield SensorClient(
             calls=calls,
             scene_id=scene_id,
             cameras={one.logical_id: one.intrinsics for one in found},
-            rig_from_camera={one.logical_id: _pose(one.rig_to_camera) for one in found},
+            rig_from_camera={one.logical_id: _seat(one) for one in found},
             width_px=width_px,
         )
 
@@ -146,10 +152,15 @@ def _one_line(place: str) -> Iterator[None]:
         raise DataError(f"{place}: {code}: {said[:300]}") from None
 
 
-def _pose(message: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  a Pose
-    vec, quat = message.vec, message.quat
+def _seat(camera: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  an AvailableCamera
+    """Where a camera sits in the car; the renderer may be anybody's."""
+    vec, quat = camera.rig_to_camera.vec, camera.rig_to_camera.quat
     wxyz = torch.tensor([quat.w, quat.x, quat.y, quat.z], dtype=torch.float64)
     xyz_m = torch.tensor([vec.x, vec.y, vec.z], dtype=torch.float64)
+    spec = camera.intrinsics
+    is_told = bool(xyz_m.isfinite().all()) and abs(float(wxyz.norm()) - 1) < 0.01
+    if not is_told or not 0 < min(spec.resolution_w, spec.resolution_h) <= MOST_PX:
+        raise DataError(f"camera {camera.logical_id[:80]!r}: no seat in the car, or no size")
     return rigid_from_rotation(rotation_from_quaternion(wxyz), xyz_m)
 
 

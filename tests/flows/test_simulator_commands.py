@@ -130,7 +130,8 @@ def test_drive_goes_through_the_server_and_writes_film_and_table(tiny_run, tmp_p
     assert json.dumps(told)
 
 
-def test_wrong_words_of_a_drive_are_refused(tiny_run, tmp_path):
+def test_wrong_words_of_a_drive_are_refused(tiny_run, tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarpainter_models.serving.sensor_client.CONNECT_S", 0.3)
     drive = ("drive", tiny_run.run_id, "--out", tmp_path / "d")
     for words, complaint in (
         (("--policy", "fast"), "expected lane-keep, log, idm or a .py file"),
