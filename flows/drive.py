@@ -1,6 +1,5 @@
 """Drive a policy through a finished run, its cameras asked for over gRPC as a simulator does."""
 
-import csv
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,20 +20,15 @@ from lidarpainter_models.serving.closed_loop import STEP_S, ClosedLoop, Moment, 
 from lidarpainter_models.serving.drive_film import film_image, shown_cameras
 from lidarpainter_models.serving.policies import policy_named
 from lidarpainter_models.serving.sensor_client import connected
-from lidarpainter_models.storage.whole_files import whole_file
 from tasks.exports.simulator import driven_street
 from tasks.progress import listener
 from tasks.runs import FinishedRun, open_run
 
 STAGE = "drive"
-FILM_FILE, TABLE_FILE = "drive.mp4", "drive.csv"
+FILM_FILE = "drive.mp4"
 LEAST_S = 2 * STEP_S
 START_S = 60.0
 """How long a server of one's own may take to be there."""
-COLUMNS = (
-    *("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration_mps2", "steering_rad"),
-    *("is_off_road", "is_off_ground", "aside_m", "least_confidence"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +47,7 @@ class DriveRequest:
 
 
 def drive_run(store: Store, run: str, request: DriveRequest, out: Path) -> dict[str, Any]:
-    """Drive, and write a film and a table of all moments into a folder.
+    """Drive, and write a film into a folder.
 
     Returns:
         What `drive --json` prints.
@@ -96,7 +90,6 @@ def drive_run(store: Store, run: str, request: DriveRequest, out: Path) -> dict[
             film.add(film_image(moment, shown))
             moments.append(replace(moment, frames=_without_images(moment)))
             listener().advanced(STAGE, len(moments), num_moments(seconds), "")
-    _write_table(out / TABLE_FILE, moments)
     return {
         "run_id": finished.run_id,
         "scene": finished.scene_id,
@@ -106,7 +99,6 @@ def drive_run(store: Store, run: str, request: DriveRequest, out: Path) -> dict[
         **loop.judged(moments),
         "lanes_assumed": bool(street.surroundings.road.lane.assumed),
         "film": str(out / FILM_FILE),
-        "table": str(out / TABLE_FILE),
     }
 
 
@@ -162,25 +154,3 @@ def _renderer(store: Store, finished: FinishedRun, request: DriveRequest) -> Ite
 def _without_images(moment: Moment) -> dict[str, Any]:
     """How far the frames of a moment can be trusted; a drive's images do not fit into memory."""
     return {name: replace(frame, rgb_u8=frame.rgb_u8[:0]) for name, frame in moment.frames.items()}
-
-
-def _write_table(path: Path, moments: list[Moment]) -> None:
-    """One row for every moment."""
-    with whole_file(path) as aside, aside.open("w", encoding="ascii", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(COLUMNS)
-        for moment in moments:
-            state = moment.state
-            said = [one.confidence for one in moment.frames.values() if one.confidence is not None]
-            numbers = (state.x_m, state.y_m, state.yaw_rad, state.speed_mps)
-            steered = (moment.acceleration_mps2, state.steering_rad)
-            table.writerow(
-                [
-                    f"{moment.time_s:.1f}",
-                    *(f"{number:.4f}" for number in (*numbers, *steered)),
-                    int(moment.is_off_road),
-                    int(moment.is_off_ground),
-                    f"{moment.aside_m:.3f}",
-                    "" if not said else f"{min(said):.4f}",
-                ]
-            )

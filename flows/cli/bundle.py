@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_table, say_status
+from flows.cli.doctor import tell_findings
+from flows.cli.output import say_status
 from flows.cli.shared_options import AsJson, described
-
-UNFIT = 2
 
 WORDS = """
 file: The bundle, a .usdz file of anybody.
@@ -24,16 +23,4 @@ def check_bundle(file: Annotated[Path, typer.Argument()], as_json: AsJson = Fals
     say_status(f"looking at {file}")
     from lidarpainter_models.export import bundle_checks
 
-    findings = bundle_checks.check_bundle(file)
-    is_fit = all(finding.verdict != "fail" for finding in findings)
-    if as_json:
-        rows = [
-            {"name": finding.name, "verdict": finding.verdict, "detail": finding.detail}
-            for finding in findings
-        ]
-        print_json({"bundle": str(file), "is_fit": is_fit, "findings": rows})
-    else:
-        cells = [[finding.name, finding.verdict, finding.detail] for finding in findings]
-        print_table(str(file), ["what", "verdict", "detail"], cells, num_text_columns=3)
-    if not is_fit:
-        raise typer.Exit(UNFIT)
+    tell_findings("bundle", str(file), bundle_checks.check_bundle(file), as_json=as_json)

@@ -1,8 +1,9 @@
 """`lidarpainter doctor`: is this machine, this scene or this dataset fit for work?"""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -45,18 +46,32 @@ def doctor(
         findings = data_checks.check_dataset(open_store(), subject, root, out)
     else:
         findings = data_checks.check_stored_scene(existing_store(), subject, out, _looking_at)
+    tell_findings("subject", subject or "environment", findings, as_json=as_json)
+
+
+def tell_findings(
+    kind: str,
+    subject: str,
+    findings: Sequence[Any],
+    *,
+    as_json: bool,
+) -> None:
+    """Print what checks found, as a table or one object; a failure ends the command with code 2.
+
+    Args:
+        kind: what the object calls the subject.
+        subject: what was looked at.
+        findings: each with `name`, `verdict` and `detail`.
+        as_json: whether one object is printed.
+    """
     is_fit = all(finding.verdict != "fail" for finding in findings)
+    rows = [(finding.name, finding.verdict, finding.detail) for finding in findings]
+    columns = ("name", "verdict", "detail")
     if as_json:
-        rows = [
-            {"name": finding.name, "verdict": finding.verdict, "detail": finding.detail}
-            for finding in findings
-        ]
-        print_json({"subject": subject or "environment", "is_fit": is_fit, "findings": rows})
+        found = [dict(zip(columns, row, strict=True)) for row in rows]
+        print_json({kind: subject, "is_fit": is_fit, "findings": found})
     else:
-        cells = [[finding.name, finding.verdict, finding.detail] for finding in findings]
-        print_table(
-            subject or "environment", ["what", "verdict", "detail"], cells, num_text_columns=3
-        )
+        print_table(subject, ["what", *columns[1:]], rows, num_text_columns=3)
     if not is_fit:
         raise typer.Exit(UNFIT)
 

@@ -19,7 +19,7 @@ policy: Who drives: lane-keep (the middle of the lane), log (as recorded), idm (
   or a Python file with a function drive(observation) that returns acceleration in m/s2 and steering
   in radians.
 against: Renderer that is asked for the images, as HOST:PORT; a server of this run if absent.
-out: Folder that drive.mp4 and drive.csv are written to.
+out: Folder that drive.mp4, the film, is written to.
 seconds: How long to drive; as long as the log is if absent.
 lane_change: Metres to the left of its line that the policy is to drive, after some seconds;
   negative is to the right.
