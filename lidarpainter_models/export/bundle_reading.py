@@ -25,6 +25,8 @@ MOST_BYTES = 64 * 2**30
 """Of all members together, as they say themselves."""
 MOST_RATIO = 200
 """Text is seldom compressed to less than a hundredth; a bomb is, to less than a thousandth."""
+MOST_DEPTH = 20
+"""Of YAML: lists in lists, tables in tables."""
 MOST_JSON_BYTES, MOST_YAML_BYTES, MOST_XML_BYTES = 256 * 2**20, 2**20, 64 * 2**20
 _ENCRYPTED = 1
 
@@ -79,9 +81,13 @@ class OpenedBundle:
         import yaml
 
         content = self.read(name, MOST_YAML_BYTES)
+        depth = 0
         try:
-            if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
-                raise DataError(f"{name} has aliases, expected plain values")
+            for event in yaml.parse(content):  # lazily: what is deep takes a parser very long
+                depth += isinstance(event, yaml.CollectionStartEvent)
+                depth -= isinstance(event, yaml.CollectionEndEvent)
+                if isinstance(event, yaml.AliasEvent) or depth > MOST_DEPTH:
+                    raise DataError(f"{name} is no YAML of plain values: aliases, or too deep")
             return yaml.safe_load(content)
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             if isinstance(error, DataError):
