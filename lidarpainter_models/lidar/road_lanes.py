@@ -42,11 +42,11 @@ LEAST_SHARE, SOLID_SHARE = 0.12, 0.6
 LEAST_BRIGHT = 3.0
 """Paint returns more than the road does, by so many deviations of the road at its range."""
 RANGE_BIN_M, MOST_RANGE_M = 3.0, 30.0
-LEVEL_M = 0.1
-"""What rises by more within the width of a lane is no road to drive on, but a kerb."""
+ON_ROAD_M = 0.05
+"""Paint is flat: what is higher above the ground or deeper below it is none."""
 
-MOST_FALL = 0.04
-"""A road falls to its edge by so much of the way to it."""
+KERB_M = 0.06
+"""What rises or falls by more within two bins is no road to drive on, but a kerb."""
 
 Mark = Literal["solid", "broken", "none"]
 
@@ -188,7 +188,7 @@ def marking_points(
             points = scene.read_sweep(sweep)
             xyz_m = points.xyz_m.double().numpy()
             range_m = np.linalg.norm(xyz_m - sweep.world_from_lidar[:3, 3].numpy(), axis=1)
-            on_road = np.abs(xyz_m[:, 2] - ground.at(xyz_m[:, :2])) < LEVEL_M / 2
+            on_road = np.abs(xyz_m[:, 2] - ground.at(xyz_m[:, :2])) < ON_ROAD_M
             bright = _is_bright(points.intensity.numpy()[on_road], range_m[on_road])
             found.append(xyz_m[on_road][bright, :2])
     return np.concatenate(found)
@@ -309,10 +309,11 @@ def _assumed_road(line: RoadLine, ground: GroundSurface, trusted_m: tuple[float,
     lanes = [Lane(right_d_m=-half, left_d_m=half, assumed="no marking: 3.5 m wide")]
     for side, reach_m in zip((1, -1), trusted_m, strict=True):
         places = line.place(line.s_m[:, None], side * aside[None])
-        rise_m = np.abs(ground.at(places) - ground.at(line.place(line.s_m, 0.0))[:, None])
-        rise_m = np.nan_to_num(rise_m, nan=np.inf)
-        is_level = np.median(rise_m - MOST_FALL * aside, axis=0) < LEVEL_M
-        free = len(aside) if is_level.all() else int(is_level.argmin())
+        rise_m = ground.at(places) - ground.at(line.place(line.s_m, 0.0))[:, None]
+        profile_m = np.median(np.nan_to_num(rise_m, nan=np.inf), axis=0)
+        with np.errstate(invalid="ignore"):  # unknown beside unknown
+            is_level = np.append(np.abs(profile_m[2:] - profile_m[:-2]) < KERB_M, [False, False])
+        free = int(is_level.argmin())
         edge = half + min(free * BIN_M, reach_m)
         if edge - half > 0.3:
             ends = (half, edge) if side > 0 else (-edge, -half)

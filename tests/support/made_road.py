@@ -3,6 +3,8 @@
 Straight or bent, it falls to its right edge and rises along; a kerb, a car, a wall stand on it.
 """
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -103,11 +105,17 @@ def moving_track(actor_id, s_m, d_m, *, times_ns, yaw_rad=0.0, is_moving=True):
     )
 
 
+@cache
+def street_and_ground(curvature_per_m, count):
+    """Points of the street and the ground that is found in them; made once."""
+    street = map_points(road_points(count, curvature_per_m=curvature_per_m)[0])
+    return street, ground_surface(street, road_path(curvature_per_m))
+
+
 def road_surroundings(lines=None, *, curvature_per_m=0.0, tracks=(), count=120_000):
     """Ground, street and lanes of the road."""
     path = road_path(curvature_per_m)
-    street = map_points(road_points(count, curvature_per_m=curvature_per_m)[0])
-    ground = ground_surface(street, path)
+    street, ground = street_and_ground(curvature_per_m, count)
     road = driven_road_lanes(
         driven_line(path, ground),
         marking_places(lines or {-1.75: True, 1.75: False}, curvature_per_m),
