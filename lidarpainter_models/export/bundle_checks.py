@@ -54,7 +54,7 @@ import sys
 from pxr import Usd
 stage = Usd.Stage.Open(sys.argv[1])
 kinds = [prim.GetTypeName() for prim in stage.Traverse()]
-print(kinds.count("ParticleField3DGaussianSplat"), sum(map(bool, kinds)))
+sys.stdout.write(f"{kinds.count('ParticleField3DGaussianSplat')} {sum(map(bool, kinds))}")
 """
 
 
