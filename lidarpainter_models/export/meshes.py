@@ -25,7 +25,7 @@ MOST_BYTES = 512 * 2**20
 """Of a mesh that is read: more than ten kilometres of road."""
 MOST_HEADER_BYTES = 4096
 _VERTEX, _FACE = np.dtype("<f4"), np.dtype([("count", "u1"), ("corner", "<i4", 3)])
-Mesh = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
+Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices and the three corners of every face."""
 
 
