@@ -78,9 +78,14 @@ def test_the_ground_lies_below_the_path_and_the_map_along_it(tiny_run, bundle):
         assert np.abs(vertices[near, 2] - place[2]).max() < 0.1  # the street's ego is on the road
     assert len(read.meshes["mesh.ply"][0]) >= len(vertices)
     line = reference_line(read.road)
-    assert read.road.find("road/lanes/laneSection/right") is not None
-    for place in path_m:
-        assert np.linalg.norm(line[:, 1:3] - place[:2], axis=1).min() < 6.0
+    right = read.road.find("road/lanes/laneSection/right")
+    width_m = sum(float(lane.find("width").get("a")) for lane in right)
+    for place in path_m:  # the driven lane is right of the reference line
+        away = place[:2] - line[:, 1:3]
+        nearest = np.linalg.norm(away, axis=1).argmin()
+        along = line[min(nearest + 1, len(line) - 1), 1:3] - line[nearest - 1, 1:3]
+        to_right = along[1] * away[nearest, 0] - along[0] * away[nearest, 1]
+        assert 0 < to_right / np.linalg.norm(along) < width_m
 
 
 def test_usd_core_opens_the_bundle_as_it_is(bundle):
