@@ -5,6 +5,7 @@ actors from the simulation, and how far a frame can be trusted from trailing met
 renderer has such. World frame of the scene, metres; images are RGB bytes.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,14 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_quaternion
 from lidarpainter_models.scenes.image_bytes import decode_image
-from lidarpainter_models.serving.messages import pose_message
+from lidarpainter_models.serving.messages import LENGTH_TOLERANCE, matrix_of, pose_message
 from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.trust import KEYS
 from lidarpainter_models.serving.wire import MOST_BYTES, client, grpc_package
@@ -154,14 +153,13 @@ def _one_line(place: str) -> Iterator[None]:
 
 def _seat(camera: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  an AvailableCamera
     """Where a camera sits in the car; the renderer may be anybody's."""
-    vec, quat = camera.rig_to_camera.vec, camera.rig_to_camera.quat
-    wxyz = torch.tensor([quat.w, quat.x, quat.y, quat.z], dtype=torch.float64)
-    xyz_m = torch.tensor([vec.x, vec.y, vec.z], dtype=torch.float64)
-    spec = camera.intrinsics
-    is_told = bool(xyz_m.isfinite().all()) and abs(float(wxyz.norm()) - 1) < 0.01
+    quat, spec = camera.rig_to_camera.quat, camera.intrinsics
+    length = math.hypot(quat.w, quat.x, quat.y, quat.z)
+    seat = matrix_of(camera.rig_to_camera)
+    is_told = abs(length - 1) < LENGTH_TOLERANCE and bool(seat.isfinite().all())
     if not is_told or not 0 < min(spec.resolution_w, spec.resolution_h) <= MOST_PX:
         raise DataError(f"camera {camera.logical_id[:80]!r}: no seat in the car, or no size")
-    return rigid_from_rotation(rotation_from_quaternion(wxyz), xyz_m)
+    return seat
 
 
 def _decoded(item: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401  an item of a reply
