@@ -81,8 +81,8 @@ def reference_line(road, step_m=0.25):
 
 def profile(road, place, s_m):
     """The value of a profile of cubics along the road."""
-    rows = [[float(one.get(key)) for key in "sabcd"] for one in road.findall(f"road/{place}")]
-    rows = np.array(rows)
+    found = [[float(one.get(key)) for key in "sabcd"] for one in road.findall(f"road/{place}")]
+    rows = np.array(found)
     row = rows[np.clip(np.searchsorted(rows[:, 0], s_m, side="right") - 1, 0, len(rows) - 1)]
     ds = s_m - row[:, 0]
     return row[:, 1] + ds * (row[:, 2] + ds * (row[:, 3] + ds * row[:, 4]))
