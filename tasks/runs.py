@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from catalog.artefacts import ArtefactRef
@@ -25,6 +26,7 @@ class FinishedRun:
     final: FittedRef
     """After the last round."""
     preset: str
+    finished_at: datetime
     derived_from: str | None = None
     """The run that this one was changed from; None where it was reconstructed."""
     change: dict[str, Any] | None = None
@@ -60,6 +62,7 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
         unpainted=FittedRef(seen[0], fits[0]),
         final=FittedRef(seen[0], fits[-1]),
         preset=row["preset"],
+        finished_at=row["finished_at"],
         derived_from=row["derived_from"],
         change=json_of(row, "change") if row["change"] else None,
     )

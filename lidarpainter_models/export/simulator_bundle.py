@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import date
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ class BundleContents:
 
     run_id: str
     software: str
+    fitted_on: date
     scene: GaussianScene
     log: DrivingScene
     """As it was recorded."""
@@ -169,7 +170,7 @@ def bundle_metadata(contents: BundleContents) -> dict[str, Any]:
     return {
         "scene_id": contents.name,
         "version_string": contents.software,
-        "training_date": datetime.now(UTC).date().isoformat(),
+        "training_date": contents.fitted_on.isoformat(),
         "dataset_hash": recorded.content_digest,
         "uuid": str(uuid5(NAMESPACE_URL, f"lidarpainter:{contents.run_id}")),
         "is_resumable": False,

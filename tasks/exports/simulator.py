@@ -68,6 +68,7 @@ def export_bundle(
     times_ns = sorted({one.timestamp_ns for one in street.recorded.views_of(seen.camera_names[0])})
     contents = BundleContents(
         run_id=finished.run_id,
+        fitted_on=finished.finished_at.date(),
         software=f"lidarpainter {lidarpainter_models.__version__}",
         scene=street.scene,
         log=opened(run).scene,

@@ -29,6 +29,8 @@ def test_a_reader_that_is_not_ours_finds_the_log_in_the_bundle(tiny_run, bundle)
     assert all(start % 64 == 0 for start in read.starts)
     assert read.metadata["scene_id"] == SCENE
     assert read.metadata["logger"]["run_id"] == tiny_run.run_id
+    finished = tiny_run.store.run(tiny_run.run_id)["finished_at"]
+    assert read.metadata["training_date"] == finished.date().isoformat()
     assert read.metadata["dataset_hash"] == scene.content_digest
     assert set(read.metadata["sensors"]["camera_ids"]) == {FRONT, SIDE}
     outputs = read.metadata["training_step_outputs"]
