@@ -25,8 +25,8 @@ COMFORT_MPS2, BRAKING_MPS2 = 1.5, 2.0
 """Acceleration and comfortable deceleration of Treiber et al. (2000)."""
 HEADWAY_S, STANDING_GAP_M, EXPONENT = 1.5, 2.0, 4
 """Time headway, gap between cars that stand, and exponent of the same paper."""
-SPEED_GAIN_PER_S = 1.0
-"""Acceleration for each m/s that is lacking."""
+SPEED_GAIN_PER_S, LOG_GAIN_PER_S = 1.0, 5.0
+"""Acceleration for each m/s that is lacking; who drives as recorded is as quick as the log."""
 LEAD_HALF_WIDTH_M = 1.4
 """Whose middle is nearer to the line drives or stands in front."""
 MAIN = "drive"
@@ -128,7 +128,8 @@ def lane_keep(seen: Observation) -> tuple[float, float]:
 
 def follow_log(seen: Observation) -> tuple[float, float]:
     """Drive the recorded way as fast as it was driven."""
-    return _towards(seen.recorded_speed_mps, seen), pure_pursuit(seen, seen.recorded_m)
+    lacking_mps = seen.recorded_speed_mps - seen.speed_mps
+    return LOG_GAIN_PER_S * lacking_mps, pure_pursuit(seen, seen.recorded_m)
 
 
 def follow_lead(seen: Observation) -> tuple[float, float]:
