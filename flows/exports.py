@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from catalog.store import Store
+from flows.lidar import sweeps_of_run
 from flows.views import envelope_of, viewed_run
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.formats import ExportFormat, export_format
+from lidarpainter_models.export.simulated_sweeps import SweepRequest
 from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
 from tasks.exports.dataset import export_dataset
 from tasks.exports.scene import SceneRequest, export_scene
@@ -69,6 +71,11 @@ def _export(
             return export_scene(viewed.run, finished.final, row, scene, out)
         case "sweeps":
             return export_sweeps(viewed.run, row, request.frames, out)
+        case "simulated":
+            wanted = SweepRequest(
+                trajectory=request.trajectory, frames=request.frames, file_format="parquet"
+            )
+            return sweeps_of_run(store, finished, wanted, out)
         case "dataset":
             return export_dataset(viewed, request, row, out)
         case "page":

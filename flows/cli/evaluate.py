@@ -16,13 +16,14 @@ from lidarpainter_models.errors import ConfigError
 
 FLICKER = "flicker"
 CROSS_CAMERA = "cross-camera"
+LIDAR = "lidar"
 STRIP_FIGURES = {
     "psnr": "seen by both, calibrated",
     "uncalibrated_psnr": "seen by both, as delivered",
     "whole_image_psnr": "all, as delivered",
 }
 NEURAD = "neurad"
-PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, FLICKER)
+PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, FLICKER, LIDAR)
 WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
@@ -31,8 +32,8 @@ WORDS = """
 protocol: How the run is scored: paper (held-out views, and views beside the path where they are
   known), truth (views beside the path of a synthetic street, against exact images), neurad (every
   held-out image at its recorded pose, for runs with --split linspace: the protocol of
-  neurad-studio), cross-camera (cameras that no fit saw), or flicker (neighbouring frames against
-  each other).
+  neurad-studio), cross-camera (cameras that no fit saw), flicker (neighbouring frames against each
+  other), or lidar (simulated sweeps against those of held-out frames).
 postpaint: Also score what is painted at view time.
 painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the run's own
   if absent. Scores of another one are printed, but not entered into the catalog.
@@ -69,6 +70,12 @@ def evaluate(  # noqa: PLR0913 - the options of a command
 
     previously, run_id = parse_previous(previous), named_run(run)
     check_painter(painter)
+    if protocol == LIDAR:
+        refuse_unused(
+            f"--protocol {LIDAR}", {"--postpaint": postpaint, "--painter": painter is not None}
+        )
+        _judge_lidar(run_id, as_json=as_json)
+        return
     from flows.evaluate import EvaluationRequest, evaluate_run
 
     request = EvaluationRequest(
@@ -88,6 +95,27 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         {FLICKER: _show_flicker, CROSS_CAMERA: _show_strips}.get(protocol, _show)(result)
 
 
+def _judge_lidar(run_id: str, *, as_json: bool) -> None:
+    """Judge the simulated sweeps of a run, and show the figures."""
+    from catalog.store import existing_store
+    from flows.cli.progress import shown_progress
+    from flows.lidar import evaluate_lidar_run
+
+    with shown_progress():
+        result = evaluate_lidar_run(existing_store(), run_id)
+    if as_json:
+        print_json(result)
+        return
+    found = result[LIDAR]
+    rows = [
+        [protocol, name, value]
+        for protocol in ("neurad-studio", "own")
+        for name, value in found[protocol].items()
+    ]
+    title = f"{result['scene']}, run {result['run_id']}: {found['num_sweeps']} held-out sweeps"
+    print_table(title, ["protocol", "figure", found["lidar"]], rows, num_text_columns=2)
+
+
 def _check(
     protocol: str, previous: str | None, weights: tuple[Path | None, ...], *, all_views: bool
 ) -> None:
@@ -96,7 +124,7 @@ def _check(
         raise ConfigError(f"--protocol {protocol!r}: expected {', '.join(PROTOCOLS)}")
     if previous is not None and protocol != FLICKER:
         raise ConfigError(f"--previous is judged by --protocol {FLICKER}, not by {protocol}")
-    if protocol in (CROSS_CAMERA, FLICKER):
+    if protocol in (CROSS_CAMERA, FLICKER, LIDAR):
         given = {name: path is not None for name, path in zip(WEIGHTS, weights, strict=True)}
         refuse_unused(f"--protocol {protocol}", {"--all-views": all_views, **given})
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_pairs
+from flows.cli.output import print_json, print_pairs, print_result
 from flows.cli.shared_options import (
     AsJson,
     TrajectorySpec,
@@ -13,6 +13,7 @@ from flows.cli.shared_options import (
     described,
     parse_frames,
     parse_previous,
+    refuse_unused,
     with_told_collisions,
 )
 from lidarpainter_models.errors import ConfigError
@@ -27,7 +28,14 @@ previous: What becomes of the image painted before: unused, mixed (into what the
 video: Also write video.mp4, a film of each camera, and one of all together.
 depth: Also write depth as 16-bit PNG, in 256ths of a metre.
 semantics: Also write who is where, as 16-bit PNG with a legend.
+lidar: Write simulated sweeps in place of images: of the log's own LiDAR (log), of a sensor by name
+  (hdl-32e, hdl-64e, vlp-16, pandar64, pandar128, at128, os1-128), or of one in a .json file.
+lidar_format: Files of the sweeps: pcd, pcd.bin, npz or parquet; the last two hold whom each point
+  met.
 """
+
+OF_IMAGES = ("--camera", "--width", "--painter", "--previous", "--fps", "--beside")
+"""The options that sweeps have no use for, beside flags."""
 
 
 @described(WORDS)
@@ -48,6 +56,8 @@ def render(  # noqa: PLR0913 - the options of a command
     semantics: bool = False,
     beside: str | None = None,
     allow_collisions: bool = False,
+    lidar: str | None = None,
+    lidar_format: str = "pcd",
     as_json: AsJson = False,
 ) -> None:
     """Render a finished run where nobody drove.
@@ -55,6 +65,8 @@ def render(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter render latest --trajectory lateral:2 --postpaint --out pictures
 
     Down a lane and up: lidarpainter render latest --trajectory lane-change:-3.5+up:1 --out p
+
+    Sweeps of another LiDAR: lidarpainter render latest --trajectory up:1 --lidar vlp-16 --out s
 
     A film: lidarpainter render latest --trajectory lateral:2 --video --beside recorded --out p
     """
@@ -64,6 +76,17 @@ def render(  # noqa: PLR0913 - the options of a command
     if len(sequences) > 1:
         raise ConfigError(f"--previous {previous!r}: expected one of them here")
     run_id = checked_words(run, trajectory, painter)
+    if lidar is not None:
+        given = (camera, width, painter, previous, fps, beside)
+        values = dict(zip(OF_IMAGES, given, strict=True))
+        flags = {"--postpaint": postpaint, "--video": video, "--depth": depth}
+        flags |= {"--semantics": semantics, "--prompt": prompt != "clear"}
+        said = {name: value is not None for name, value in values.items()}
+        refuse_unused("--lidar", said | flags)
+        _render_lidar(run_id, trajectory, lidar, lidar_format, followed, out, as_json=as_json)
+        return
+    if lidar_format != "pcd":
+        raise ConfigError("--lidar-format needs --lidar")
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.views import render_run
@@ -90,3 +113,33 @@ def render(  # noqa: PLR0913 - the options of a command
         print_json(result)
     else:
         print_pairs(f"images of {result['scene']}", with_told_collisions(result))
+
+
+def _render_lidar(
+    run: str,
+    trajectory: str,
+    lidar: str,
+    file_format: str,
+    frames: slice | None,
+    out: Path,
+    *,
+    as_json: bool,
+) -> None:
+    """Write sweeps in place of images."""
+    from lidarpainter_models.export.simulated_sweeps import SweepRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.lidar.sensors import read_sensor
+
+    request = SweepRequest(
+        trajectory=parse_trajectory(trajectory),
+        sensor=None if lidar == "log" else read_sensor(lidar),
+        frames=frames,
+        file_format=file_format,
+    )
+    from catalog.store import existing_store
+    from flows.cli.progress import shown_progress
+    from flows.lidar import render_lidar_run
+
+    with shown_progress():
+        result = render_lidar_run(existing_store(), run, request, out.absolute())
+    print_result(f"sweeps of {result['scene']}", result, as_json=as_json)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -17,7 +17,7 @@ from lidarpainter_models.lidar.collisions import Collision, MovingBody, find_col
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.actor_names import named_actor, path_of_track
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 
@@ -46,16 +46,28 @@ class MovedCameras:
         """
         if self.trajectory.is_recorded:
             return tuple(cameras)
+        poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
+        moved = self.moved_poses(views, poses)
+        return tuple(camera.at(pose) for camera, pose in zip(cameras, moved, strict=True))
+
+    def moved_poses(
+        self, views: Sequence[RecordedView | Sweep], poses: Float[Tensor, "views 4 4"]
+    ) -> Float[Tensor, "views 4 4"]:
+        """World poses, float64, of one sensor at some moments, moved.
+
+        Raises:
+            ConfigError: the path leads too far out of the ends of the recorded one.
+            SceneError: it names an actor that is not there.
+        """
+        if self.trajectory.is_recorded:
+            return poses
         road, place = self._road_of(views), self.trajectory.placed
         moments = self._moments(views, road)
-        poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
         if self.as_rig:
             egos = road.world_from_body[moments.rows]
             moved_from_ego = place(egos, road, moments, self._path_of) @ invert_rigid(egos)
-            poses = moved_from_ego @ poses
-        else:
-            poses = place(poses, road, moments, self._path_of, is_camera=True)
-        return tuple(camera.at(pose) for camera, pose in zip(cameras, poses, strict=True))
+            return moved_from_ego @ poses
+        return place(poses, road, moments, self._path_of, is_camera=True)
 
     def collisions(
         self, views: Sequence[RecordedView], cameras: Sequence[Camera], street: MapPoints
@@ -70,7 +82,7 @@ class MovedCameras:
         start_ns = int(self.road.timestamps_ns[0])
         return find_collisions(body, street, self.tracks, start_ns=start_ns)
 
-    def _road_of(self, views: Sequence[RecordedView]) -> DrivenPath:
+    def _road_of(self, views: Sequence[RecordedView | Sweep]) -> DrivenPath:
         """The way that a trajectory leads off.
 
         Where another path takes its place it has a pose at every exposure: frames have other times,
@@ -81,7 +93,7 @@ class MovedCameras:
         times_ns = torch.cat([self.road.timestamps_ns, _times_ns(views)]).unique()
         return self.road.driven_on(times_ns)
 
-    def _moments(self, views: Sequence[RecordedView], road: DrivenPath) -> Moments:
+    def _moments(self, views: Sequence[RecordedView | Sweep], road: DrivenPath) -> Moments:
         times_ns = _times_ns(views)
         if self.trajectory.other is None:
             frames = [self.recorded.frame_position(view.frame_index) for view in views]
@@ -102,5 +114,5 @@ class MovedCameras:
         return path_of_track(named_actor([*known.values()], name, self.road))
 
 
-def _times_ns(views: Sequence[RecordedView]) -> Int[Tensor, " views"]:
+def _times_ns(views: Sequence[RecordedView | Sweep]) -> Int[Tensor, " views"]:
     return torch.tensor([view.timestamp_ns for view in views])

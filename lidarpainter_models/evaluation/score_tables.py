@@ -8,6 +8,8 @@ FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
 NEURAD = "neurad"
 """Entry of an evaluation by the protocol of neurad-studio, by camera."""
+LIDAR = "lidar"
+"""Entry of an evaluation that judged simulated sweeps."""
 ENVELOPE = "envelope"
 """Entry of the scores of a run: how far beside the path the scene can be trusted."""
 HELD_OUT = "held_out"
@@ -29,13 +31,20 @@ def metric_values(
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
     Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
-    have shifted paths alone, those by the protocol of neurad-studio cameras.
+    have shifted paths alone, those by the protocol of neurad-studio cameras, and those of sweeps
+    figures by whose protocol they are.
     """
     if NEURAD in scores:
         return [
             (NEURAD, camera, name, value, values.get(f"{name}_reason"))
             for camera, values in scores[NEURAD].items()
             for name, value in _numbers(values)
+        ]
+    if LIDAR in scores:
+        return [
+            (LIDAR, protocol, name, value, "too few rays" if value is None else None)
+            for protocol in ("neurad-studio", "own")
+            for name, value in _numbers(scores[LIDAR][protocol])
         ]
     if FLICKER in scores:
         return [

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from lidarpainter_models.errors import ConfigError
 
-FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "bundle"]
+FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "simulated", "bundle"]
 """What a format holds: the fitted scene, recorded images with poses, views along a trajectory, a
-page that plays the drive, recorded LiDAR sweeps, or all that a simulator loads."""
+page that plays the drive, recorded LiDAR sweeps, simulated ones, or all that a simulator loads."""
 
 _WHERE = ("--trajectory", "--camera", "--frames", "--width")
 _WHEN = ("--time", "--actors", "--sky")
@@ -160,6 +160,12 @@ FORMATS: tuple[ExportFormat, ...] = (
         summary="recorded LiDAR sweeps as nuScenes' .pcd.bin",
         writer=f"{_HERE}.lidar_files:write_pcd_bin",
         options=("--frames",),
+    ),
+    ExportFormat(
+        name="sweeps",
+        kind="simulated",
+        summary="simulated LiDAR sweeps along a trajectory, as Parquet",
+        options=("--trajectory", "--frames"),
     ),
     ExportFormat(
         name="simulator",

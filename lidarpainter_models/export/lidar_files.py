@@ -1,8 +1,10 @@
-"""LiDAR sweeps as other programs read them: PCD, and the five columns of nuScenes.
+"""LiDAR sweeps as other programs read them: PCD, the five columns of nuScenes, NPZ and Parquet.
 
 Points stand in the frame of their sensor at the time of the sweep, motion already taken out.
 """
 
+from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,60 @@ def write_pcd_bin(path: Path, sweep: Sweep, points: SweepPoints) -> None:
     columns = [points.intensity[:, None], points.ring.float()[:, None]]
     table = torch.cat([points_lidar(sweep, points), *columns], dim=1)
     write_whole(path, table.numpy().astype("<f4").tobytes())
+
+
+def write_npz(
+    path: Path, sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
+) -> None:
+    """Write a sweep as NumPy arrays: every column of `sweep_columns` under its name.
+
+    Raises:
+        WriteError: the disk refuses.
+    """
+    content = BytesIO()
+    np.savez_compressed(content, **sweep_columns(sweep, points, actor_ids))
+    write_whole(path, content.getvalue())
+
+
+def write_parquet(
+    path: Path, sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
+) -> None:
+    """Write a sweep as a Parquet table of `sweep_columns`.
+
+    Raises:
+        WriteError: the disk refuses.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    content = BytesIO()
+    parquet.write_table(pa.table(sweep_columns(sweep, points, actor_ids)), content)
+    write_whole(path, content.getvalue())
+
+
+def sweep_columns(
+    sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Everything that is known of a sweep's points, column by column.
+
+    Args:
+        sweep: when and where it was taken.
+        points: its points in the world.
+        actor_ids: whom each point has met, empty where it met the street; None where nobody says.
+
+    Returns:
+        `x`, `y`, `z` (float32, metres, in the frame of the sensor at the time of the sweep),
+        `intensity`, `ring`, `return`, `timestamp_ns`, and `actor` where it is known.
+    """
+    places = points_lidar(sweep, points)
+    columns = {name: place.numpy() for name, place in zip("xyz", places.unbind(1), strict=True)}
+    columns["intensity"] = points.intensity.numpy().astype(np.float32)
+    columns["ring"] = points.ring.numpy().astype(np.int16)
+    columns["return"] = points.return_index.numpy().astype(np.int8)
+    columns["timestamp_ns"] = sweep.timestamp_ns + points.time_offset_ns.numpy().astype(np.int64)
+    if actor_ids is not None:
+        columns["actor"] = np.array(actor_ids, dtype=str)
+    return columns
 
 
 def points_lidar(sweep: Sweep, points: SweepPoints) -> torch.Tensor:

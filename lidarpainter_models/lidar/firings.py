@@ -69,6 +69,8 @@ class SweepRays:
 class MountedLidar:
     """A sensor of a log: its beams, how it leans, and the way it went."""
 
+    name: str
+    """What the log calls it."""
     sensor: LidarSensor
     lidar_from_sensor: Float[Tensor, "4 4"]
     """Turn of the sensor in the frame that the log calls its LiDAR's; float64."""
@@ -113,7 +115,9 @@ def mounted_lidar(
     lidar_from_sensor = torch.eye(4, dtype=torch.float64)
     lidar_from_sensor[:3, :3] = torch.from_numpy(turn)
     sensor = preset_of(lidar_name) or _estimated(lidar_name, seen, scene)
-    return MountedLidar(sensor=sensor, lidar_from_sensor=lidar_from_sensor, path=path)
+    return MountedLidar(
+        name=lidar_name, sensor=sensor, lidar_from_sensor=lidar_from_sensor, path=path
+    )
 
 
 def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> SweepRays:

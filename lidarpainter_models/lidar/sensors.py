@@ -5,9 +5,10 @@ is not known of a sensor is estimated from its sweeps (`firings`); these presets
 sheets.
 """
 
+import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 
 MOST_BEAMS, MOST_STEPS = 1024, 65_536
+MOST_FILE_BYTES = 1_000_000
 MOST_TURN_S, MOST_RANGE_M, MOST_DIVERGENCE_RAD = 10.0, 2000.0, 0.1
 
 
@@ -250,12 +252,21 @@ def preset_of(name: str) -> LidarSensor | None:
     return PRESETS.get(name.lower().replace("_", "-"))
 
 
-def sensor_named(text: str, known: Sequence[str] = tuple(PRESETS)) -> LidarSensor:
-    """A preset by its name.
+def read_sensor(text: str) -> LidarSensor:
+    """A preset by its name, or the sensor of a JSON file.
 
     Raises:
-        ConfigError: there is none of this name.
+        ConfigError: there is no such preset or file, or the file holds no sensor.
     """
-    if text not in PRESETS:
-        raise ConfigError(f"--lidar {text!r}: expected {', '.join(known)}, or a sensor's .json")
-    return PRESETS[text]
+    if text in PRESETS:
+        return PRESETS[text]
+    path = Path(text)
+    if path.suffix != ".json":
+        raise ConfigError(f"sensor {text!r}: expected {', '.join(PRESETS)}, log, or a .json file")
+    try:
+        if path.stat().st_size > MOST_FILE_BYTES:
+            raise ConfigError(f"{text}: larger than {MOST_FILE_BYTES} bytes, expected a sensor")
+        record = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{text}: cannot be read as a sensor: {error}") from None
+    return sensor_from_record(record, text)

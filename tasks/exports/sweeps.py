@@ -5,6 +5,7 @@ from typing import Any
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.export.formats import ExportFormat
+from lidarpainter_models.scenes.records import Sweep
 from tasks.exports.places import new_folder
 from tasks.json_files import write_json
 from tasks.opened import opened
@@ -39,17 +40,20 @@ def export_sweeps(
         for done, sweep in enumerate(sweeps, start=1):
             name = f"{sweep.lidar_name}/{sweep.frame_index:04d}{ending}"
             write(folder / name, sweep, scene.read_sweep(sweep))
-            rows.append(
-                {
-                    "file": name,
-                    "lidar": sweep.lidar_name,
-                    "frame_index": sweep.frame_index,
-                    "timestamp_ns": sweep.timestamp_ns,
-                    "world_from_lidar": sweep.world_from_lidar.reshape(-1).tolist(),
-                    "num_points": sweep.num_points,
-                }
-            )
+            rows.append(sweep_record(name, sweep))
             listener().advanced(STAGE, done, len(sweeps), "")
         write_json(folder / INDEX_FILE, {"sweeps": rows})
     num_points = sum(sweep.num_points for sweep in sweeps)
     return {"path": str(out), "num_sweeps": len(sweeps), "num_points": num_points}
+
+
+def sweep_record(name: str, sweep: Sweep) -> dict[str, Any]:
+    """What the list of sweeps says of one: its file, when it was taken and where."""
+    return {
+        "file": name,
+        "lidar": sweep.lidar_name,
+        "frame_index": sweep.frame_index,
+        "timestamp_ns": sweep.timestamp_ns,
+        "world_from_lidar": sweep.world_from_lidar.reshape(-1).tolist(),
+        "num_points": sweep.num_points,
+    }

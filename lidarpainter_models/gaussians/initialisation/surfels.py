@@ -80,11 +80,12 @@ def surfels_from_points(
     body: int = 0,
     sh_degree: int = 1,
     most_sigma_m: Float[Tensor, " points"] | None = None,
+    least_thickness: float = LEAST_THICKNESS,
 ) -> GaussianSet:
     """One flat Gaussian per point, in the points' own frame.
 
     Harmonics start at zero but for the constant; `most_sigma_m` limits the standard deviation of
-    each (lone points have far neighbours).
+    each (lone points have far neighbours), `least_thickness` how flat it may be.
     """
     count = xyz_m.shape[0]
     if count == 0:
@@ -97,7 +98,7 @@ def surfels_from_points(
         sigma_m = torch.minimum(sigma_m, most_sigma_m)
     axes, spread = surface_axes(xyz_m[index].double())
     thickness = (spread[:, 0] / spread[:, 1].clamp(min=1e-6)).float()
-    thickness = thickness.clamp(LEAST_THICKNESS, 1.0)
+    thickness = thickness.clamp(least_thickness, 1.0)
     scale_m = torch.stack([sigma_m * thickness, sigma_m, sigma_m], dim=1)
     opacity = torch.full((count,), OPACITY)
     return GaussianSet(

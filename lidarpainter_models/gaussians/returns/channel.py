@@ -1,0 +1,244 @@
+"""What a LiDAR meets in a scene and what comes back: intensity, loss and noise, as learnt.
+
+Surfels stand in the frames of their bodies, as Gaussians do, and know their actors by id: so they
+go where a changed scene's actors go, and leave with those that it lacks.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.placing import joined_gaussians
+from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
+from lidarpainter_models.lidar.firings import SweepRays
+
+SCHEMA = 1
+FAR_M = 50.0
+"""Ranges are told to the heads in this unit."""
+WINDOW_M = 0.2
+"""What is measured is the mean of what stops a ray so near to where half of it has been stopped."""
+LISTED = 16
+"""Answers of a ray among which that mean is taken."""
+NOISE_EDGES_M = (0.0, 10.0, 20.0, 40.0, 80.0)
+"""From each of these ranges on noise is measured apart."""
+DROP_INPUTS, STRENGTH_INPUTS, HIDDEN = 6, 4, 16
+
+
+class Heads(torch.nn.Module):
+    """Two small networks over what a ray has met."""
+
+    def __init__(self) -> None:
+        """Start with no say: surfels alone decide."""
+        super().__init__()
+        self.drop = _head(DROP_INPUTS)
+        self.strength = _head(STRENGTH_INPUTS)
+
+    def forward(self, met: "MetSurfaces") -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
+        """Logit of the chance that a ray is lost, and intensity in [0, 1]."""
+        far, stopped = met.range_m / FAR_M, met.alpha.clamp(max=0.9999)
+        clear = torch.log(1e-3 + 1 - stopped)
+        about = torch.stack([far, met.cosine, stopped, met.drop, clear, met.strength], dim=1)
+        lost = met.drop + self.drop(about)[:, 0]
+        near = torch.log1p(met.range_m) / 3
+        about = torch.stack([far, met.cosine, near, stopped], dim=1)
+        return lost, torch.sigmoid(met.strength + self.strength(about)[:, 0])
+
+
+def _head(inputs: int) -> torch.nn.Sequential:
+    last = torch.nn.Linear(HIDDEN, 1)
+    torch.nn.init.zeros_(last.weight)
+    torch.nn.init.zeros_(last.bias)
+    return torch.nn.Sequential(torch.nn.Linear(inputs, HIDDEN), torch.nn.GELU(), last)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MetSurfaces:
+    """What rays have met, blended; 0 where they met nothing."""
+
+    range_m: Float[Tensor, " rays"]
+    alpha: Float[Tensor, " rays"]
+    cosine: Float[Tensor, " rays"]
+    strength: Float[Tensor, " rays"]
+    """Logit of the intensity, as the surfels have it."""
+    drop: Float[Tensor, " rays"]
+    """Logit of the chance of being lost, likewise."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulatedSweep:
+    """What a LiDAR would measure along some rays."""
+
+    range_m: Float[Tensor, " rays"]
+    """Distance of the first return; 0 where the rays meet nothing."""
+    intensity: Float[Tensor, " rays"]
+    """In the sensor's own unit."""
+    lost: Float[Tensor, " rays"]
+    """Chance that nothing comes back."""
+    is_returned: Bool[Tensor, " rays"]
+    """Whether something does: by that chance, or by a draw."""
+    body: Int[Tensor, " rays"]
+    """Body of the scene that is met; -1 where none is."""
+    alpha: Float[Tensor, " rays"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LidarChannel:
+    """Surfels of a log and what they send back to one of its LiDARs."""
+
+    surfels: GaussianSet
+    actor_ids: tuple[str, ...]
+    """The actors that the surfels' bodies 1, 2, ... are."""
+    strength: Float[Tensor, " surfels"]
+    """Logit of the intensity."""
+    drop: Float[Tensor, " surfels"]
+    """Logit of the chance that a ray is lost."""
+    heads: Heads
+    noise_m: Float[Tensor, " bands"]
+    """Spread of measured ranges, by `NOISE_EDGES_M`."""
+    full_intensity: float
+    """What the sensor reports of the brightest surface."""
+
+    def solids(self, scene: GaussianScene) -> tuple[Solids, Int[Tensor, " solids"]]:
+        """What rays meet in a scene that this log's fit, or a change of it, has given.
+
+        Returns:
+            Solids with strength and drop as channels, their bodies those of the scene.
+        """
+        known = {track.actor_id: row for row, track in enumerate(scene.actors.recorded_tracks, 1)}
+        body_of = torch.tensor([0, *(known.get(name, -1) for name in self.actor_ids)])
+        body = body_of[self.surfels.body_index.long()]
+        kept = (body >= 0).nonzero()[:, 0]
+        surfels = replace(
+            self.surfels.select(kept), body_index=body[kept].to(self.surfels.body_index)
+        )
+        channels = torch.stack([self.strength, self.drop], dim=1)[kept]
+        unswept = [row for name, row in known.items() if name not in self.actor_ids]
+        rows = torch.isin(
+            scene.gaussians.body_index.long(), torch.tensor(unswept, dtype=torch.int64)
+        )
+        if bool(rows.any()):
+            others = without_colours(scene.gaussians.select(rows.nonzero()[:, 0]))
+            surfels = joined_gaussians([surfels, others])
+            usual = channels.median(dim=0).values.expand(len(others), 2)
+            channels = torch.cat([channels, usual])
+        return Solids(gaussians=surfels, channels=channels), surfels.body_index.long()
+
+    @torch.no_grad()
+    def simulated(
+        self, scene: GaussianScene, rays: SweepRays, *, seed: int | None = None
+    ) -> SimulatedSweep:
+        """What the LiDAR would measure along some rays.
+
+        Args:
+            scene: a fit of this log, or a change of one.
+            rays: of any sensor, from anywhere.
+            seed: draws what is lost, and noise; None takes what is likelier, without noise.
+        """
+        solids, bodies = self.solids(scene)
+        found = trace_sweep(scene, solids, rays, most_hits=LISTED)
+        share = 1 / found.alpha.clamp(min=1e-4)
+        met = MetSurfaces(
+            range_m=found.range_m,
+            alpha=found.alpha,
+            cosine=found.cosine * share,
+            strength=found.channels[:, 0] * share,
+            drop=found.channels[:, 1] * share,
+        )
+        logit, intensity = self.heads(met)
+        range_m = measured_range(found.hits, solids.gaussians.opacity, found.median_m)
+        range_m = torch.where(torch.isfinite(range_m), range_m, found.range_m)
+        lost = torch.where(found.alpha > 0, torch.sigmoid(logit), 1.0)
+        is_returned = lost < 0.5
+        if seed is not None:
+            random = torch.Generator().manual_seed(seed)
+            is_returned = torch.rand(len(lost), generator=random) >= lost
+            band = torch.bucketize(range_m, torch.tensor(NOISE_EDGES_M[1:]))
+            range_m = range_m + self.noise_m[band] * torch.randn(len(lost), generator=random)
+        nearest = found.nearest.clamp(min=0)
+        return SimulatedSweep(
+            range_m=range_m.clamp(min=0),
+            intensity=self.full_intensity * intensity,
+            lost=lost,
+            is_returned=is_returned & (found.alpha > 0),
+            body=torch.where(found.nearest >= 0, bodies[nearest], -1),
+            alpha=found.alpha,
+        )
+
+    def to_arrays(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Arrays and JSON-able metadata; `channel_from_arrays` inverts it bitwise."""
+        arrays = {f"surfels.{name}": value for name, value in self.surfels.columns().items()}
+        arrays |= {f"heads.{name}": value for name, value in self.heads.state_dict().items()}
+        arrays |= {"strength": self.strength, "drop": self.drop, "noise_m": self.noise_m}
+        return (
+            {name: value.detach().contiguous() for name, value in arrays.items()},
+            {
+                "schema": SCHEMA,
+                "actor_ids": list(self.actor_ids),
+                "full_intensity": self.full_intensity,
+            },
+        )
+
+
+def channel_from_arrays(arrays: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> LidarChannel:
+    """Rebuild a stored channel.
+
+    Raises:
+        SceneError: it was written by another version or is incomplete.
+    """
+    if metadata.get("schema") != SCHEMA:
+        raise SceneError(
+            f"a stored LiDAR channel has schema {metadata.get('schema')}, not {SCHEMA}"
+        )
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, value in arrays.items():
+        group, _, column = name.partition(".")
+        groups.setdefault(group, {})[column] = value
+    heads = Heads()
+    try:
+        heads.load_state_dict(groups["heads"])
+        return LidarChannel(
+            surfels=GaussianSet(**groups["surfels"]),
+            actor_ids=tuple(metadata["actor_ids"]),
+            strength=arrays["strength"],
+            drop=arrays["drop"],
+            heads=heads.requires_grad_(requires_grad=False),
+            noise_m=arrays["noise_m"],
+            full_intensity=float(metadata["full_intensity"]),
+        )
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise SceneError(f"a stored LiDAR channel is incomplete: {error}") from error
+
+
+def measured_range(
+    hits: RayHits,
+    opacity: Float[Tensor, " gaussians"],
+    median_m: Float[Tensor, " rays"],
+) -> Float[Tensor, " rays"]:
+    """The mean of what stops a ray near its median; the median itself where nothing is listed."""
+    beside_m = (hits.range_m - median_m[:, None]).abs()
+    weight = blended_hits(hits, opacity) * (beside_m < WINDOW_M)
+    total = weight.sum(dim=1)
+    mean_m = (weight * hits.range_m).sum(dim=1) / total.clamp(min=1e-6)
+    return torch.where(total > 0, mean_m, median_m)
+
+
+def without_colours(gaussians: GaussianSet) -> GaussianSet:
+    """The same Gaussians in one colour, to stand beside surfels."""
+    count = len(gaussians)
+    return replace(gaussians, sh_dc=torch.zeros(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))
+
+
+def thin_axes(surfels: GaussianSet) -> Float[Tensor, "surfels 3"]:
+    """Unit vectors along the thinnest axis of each, in its body's frame."""
+    axes = rotation_from_quaternion(surfels.rotation_wxyz)
+    thin = surfels.log_scale.argmin(dim=1)
+    return axes.gather(2, thin[:, None, None].expand(-1, 3, 1))[..., 0]

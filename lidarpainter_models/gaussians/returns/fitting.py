@@ -1,0 +1,255 @@
+"""Learn from a log's training sweeps which surfels are there, how bright they are and what is lost.
+
+Rays are followed once through all surfels, and once more half-way; in between what each ray has
+met stays in the same order, so a step is a few sums over lists. Surfels where rays went through
+turn clear, each moves a little along its normal, and two small heads learn what range and incidence
+do to intensity and loss (after NeuRAD, Tonderski et al., 2024). The fitted scene stays as it is.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
+from lidarpainter_models.gaussians.returns.channel import (
+    NOISE_EDGES_M,
+    Heads,
+    LidarChannel,
+    MetSurfaces,
+    thin_axes,
+)
+from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.returns.surfels import surfels_of
+from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
+from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_rays
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+
+SOFT_M, LOST_M = 0.05, 5.0
+"""Errors count as the logarithm of one and this part of them; a ray that is not stopped as this."""
+MOVED_M, MOVED_WEIGHT = 0.05, 0.1
+"""How far along its normal a surfel may be expected to move, and how much that counts."""
+STEEPEST = 5.0
+"""Metres of range per metre along the normal, at most: grazing rays say little of it."""
+INTENSITY_WEIGHT = 20.0
+RATES = {"opacity": 0.1, "offset": 2e-3, "strength": 0.1, "drop": 0.1, "heads": 5e-3}
+SLOW_FROM, SLOWER = 0.6, 0.3
+"""From this part of the steps on rates are so much lower."""
+FIRST_STRENGTH = -1.5
+
+
+def fit_lidar(
+    scene: DrivingScene,
+    fitted: GaussianScene,
+    lidar: MountedLidar,
+    frames: Sequence[int],
+    config: LidarConfig,
+    *,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> LidarChannel:
+    """Learn what a LiDAR sees of a log.
+
+    Args:
+        scene: the log, its poses as the fit corrected them.
+        fitted: whose actors stand where the fit found them; it is not changed.
+        lidar: the sensor, and the way it went.
+        frames: the training frames: no other sweep is read.
+        config: how much is learnt.
+        progress: told how many steps of how many are done.
+
+    Raises:
+        SceneError: the LiDAR swept in none of the frames, or met nothing.
+    """
+    sweeps = _sweeps(scene, lidar, frames, config)
+    surfels, actor_ids = surfels_of(scene, frames, most=config.num_surfels)
+    known = {track.actor_id: row for row, track in enumerate(fitted.actors.recorded_tracks, 1)}
+    bodies = torch.tensor([0, *(known.get(name, -1) for name in actor_ids)])
+    in_scene = bodies[surfels.body_index.long()]
+    kept = (in_scene >= 0).nonzero()[:, 0]
+    surfels, placed = surfels.select(kept), in_scene[kept].to(surfels.body_index)
+    if not len(surfels):
+        raise SceneError(f"{scene.path.name}: the sweeps of its training frames met nothing")
+    learnt = _Learnt.start(surfels, config.seed)
+    rays = _joined(sweeps)
+    brightest = float(rays.intensity.max())
+    full = 255.0 if brightest > 1.0 else 1.0
+    target = _Target(
+        range_m=rays.range_m.float(),
+        is_returned=rays.is_returned,
+        intensity=(rays.intensity / full).clamp(0, 1),
+    )
+    random = torch.Generator().manual_seed(config.seed)
+    optimiser = learnt.optimiser()
+    hits = learnt.met(fitted, placed, sweeps, config.hits)
+    for step in range(config.steps):
+        if step == config.steps // 2:
+            hits = learnt.met(fitted, placed, sweeps, config.hits)
+        if step == int(SLOW_FROM * config.steps):
+            for group in optimiser.param_groups:
+                group["lr"] *= SLOWER
+        rows = torch.randint(len(rays), (config.rays_per_step,), generator=random)
+        own = RayHits(*(column[rows] for column in hits))
+        optimiser.zero_grad(set_to_none=True)
+        learnt.loss(own, target.select(rows)).backward()
+        optimiser.step()
+        progress(step + 1, config.steps)
+    noise_m = learnt.noise(hits, target)
+    moved = replace(learnt.surfels_now(), body_index=surfels.body_index)
+    return LidarChannel(
+        surfels=moved,
+        actor_ids=actor_ids,
+        strength=learnt.strength.detach(),
+        drop=learnt.drop.detach(),
+        heads=learnt.heads.requires_grad_(requires_grad=False),
+        noise_m=noise_m,
+        full_intensity=full,
+    )
+
+
+def _sweeps(
+    scene: DrivingScene, lidar: MountedLidar, frames: Sequence[int], config: LidarConfig
+) -> list[SweepRays]:
+    """Some rays of each training sweep of the LiDAR."""
+    wanted = set(frames)
+    swept = [
+        sweep
+        for sweep in scene.sweeps
+        if sweep.frame_index in wanted and sweep.lidar_name == lidar.name
+    ]
+    if not swept:
+        raise SceneError(f"{scene.path.name}: {lidar.name!r} swept in no training frame")
+    random = torch.Generator().manual_seed(config.seed)
+    most = max(1, min(config.rays_per_sweep, config.most_rays // len(swept)))
+    found = []
+    for sweep in swept:
+        rays = recorded_rays(scene, sweep, lidar)
+        found.append(rays.select(torch.randperm(len(rays), generator=random)[:most]))
+    return found
+
+
+def _joined(sweeps: Sequence[SweepRays]) -> SweepRays:
+    names = vars(sweeps[0])
+    return SweepRays(**{name: torch.cat([getattr(one, name) for one in sweeps]) for name in names})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Target:
+    """What was measured along rays."""
+
+    range_m: Float[Tensor, " rays"]
+    is_returned: Tensor
+    intensity: Float[Tensor, " rays"]
+    """In [0, 1]."""
+
+    def select(self, rows: Tensor) -> "_Target":
+        return _Target(**{name: column[rows] for name, column in vars(self).items()})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Learnt:
+    """What is being learnt of surfels, leaves of autograd."""
+
+    surfels: GaussianSet
+    opacity_logit: Float[Tensor, " surfels"]
+    offset_m: Float[Tensor, " surfels"]
+    strength: Float[Tensor, " surfels"]
+    drop: Float[Tensor, " surfels"]
+    heads: Heads
+
+    @classmethod
+    def start(cls, surfels: GaussianSet, seed: int) -> "_Learnt":
+        count = len(surfels)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            heads = Heads()
+        return cls(
+            surfels=surfels,
+            opacity_logit=surfels.opacity_logit.clone().requires_grad_(),
+            offset_m=torch.zeros(count, requires_grad=True),
+            strength=torch.full((count,), FIRST_STRENGTH, requires_grad=True),
+            drop=torch.zeros(count, requires_grad=True),
+            heads=heads,
+        )
+
+    def optimiser(self) -> torch.optim.Optimizer:
+        leaves = {
+            "opacity": [self.opacity_logit],
+            "offset": [self.offset_m],
+            "strength": [self.strength],
+            "drop": [self.drop],
+            "heads": list(self.heads.parameters()),
+        }
+        groups = [{"params": own, "lr": RATES[name]} for name, own in leaves.items()]
+        return torch.optim.Adam(groups)
+
+    def surfels_now(self) -> GaussianSet:
+        """The surfels where they are by now, as clear as they are."""
+        moved = self.offset_m.detach()[:, None] * thin_axes(self.surfels)
+        return replace(
+            self.surfels,
+            means=self.surfels.means + moved,
+            opacity_logit=self.opacity_logit.detach().clone(),
+        )
+
+    @torch.no_grad()
+    def met(
+        self, fitted: GaussianScene, placed: Tensor, sweeps: Sequence[SweepRays], most_hits: int
+    ) -> RayHits:
+        """What the rays of all sweeps meet, offsets left out: those are added with gradient."""
+        there = replace(
+            self.surfels, body_index=placed, opacity_logit=self.opacity_logit.detach().clone()
+        )
+        solids = Solids(gaussians=there, channels=torch.zeros(len(there), 0))
+        found = [trace_sweep(fitted, solids, one, most_hits=most_hits).hits for one in sweeps]
+        return RayHits(*(torch.cat(column) for column in zip(*found, strict=True)))
+
+    def blended(
+        self, hits: RayHits
+    ) -> tuple[MetSurfaces, Float[Tensor, "rays hits"], Float[Tensor, "rays hits"]]:
+        """What rays met, and the weight and range of every answer; differentiable."""
+        weight = blended_hits(hits, torch.sigmoid(self.opacity_logit))
+        index = hits.index.clamp(min=0)
+        slope = hits.slope.clamp(-STEEPEST, STEEPEST)
+        range_m = hits.range_m + slope * self.offset_m[index]
+        alpha = weight.sum(dim=1)
+        share = weight / alpha.clamp(min=1e-4)[:, None]
+        met = MetSurfaces(
+            range_m=(share * range_m).sum(dim=1),
+            alpha=alpha,
+            cosine=(share * hits.cosine).sum(dim=1),
+            strength=(share * self.strength[index]).sum(dim=1),
+            drop=(share * self.drop[index]).sum(dim=1),
+        )
+        return met, weight, range_m
+
+    def loss(self, hits: RayHits, target: _Target) -> Tensor:
+        """How badly some rays are told, and how far surfels have moved."""
+        met, weight, range_m = self.blended(hits)
+        lost, intensity = self.heads(met)
+        away_m = (range_m - target.range_m[:, None]).abs()
+        unstopped = torch.log1p(torch.tensor(LOST_M / SOFT_M)) * (1 - met.alpha)
+        wrong = (weight * torch.log1p(away_m / SOFT_M)).sum(dim=1) + unstopped
+        is_back = target.is_returned.float()
+        back = is_back.sum().clamp(min=1)
+        dark = (intensity - target.intensity).square() * is_back
+        dropped = torch.nn.functional.binary_cross_entropy_with_logits(lost, 1 - is_back)
+        moved = (self.offset_m / MOVED_M).square().mean()
+        ranges, brightness = (wrong * is_back).sum() / back, dark.sum() / back
+        return ranges + INTENSITY_WEIGHT * brightness + dropped + MOVED_WEIGHT * moved
+
+    @torch.no_grad()
+    def noise(self, hits: RayHits, target: _Target) -> Float[Tensor, " bands"]:
+        """Spread of what was measured around what is told, band by band of range."""
+        _, weight, range_m = self.blended(hits)
+        half = (weight.cumsum(dim=1) >= 0.5).int().argmax(dim=1, keepdim=True)
+        error_m = (range_m.gather(1, half)[:, 0] - target.range_m)[target.is_returned].abs()
+        band = torch.bucketize(target.range_m[target.is_returned], torch.tensor(NOISE_EDGES_M[1:]))
+        spreads = [error_m[band == row] for row in range(len(NOISE_EDGES_M))]
+        usual = error_m.median() if len(error_m) else torch.tensor(0.02)
+        # a median of absolute errors is two thirds of a spread; a few errors say nothing
+        return 1.48 * torch.stack([one.median() if len(one) > 50 else usual for one in spreads])
