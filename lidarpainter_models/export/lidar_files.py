@@ -6,6 +6,7 @@ Points stand in the frame of their sensor at the time of the sweep, motion alrea
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,7 +72,8 @@ def write_npz(
         WriteError: the disk refuses.
     """
     content = BytesIO()
-    np.savez_compressed(content, **sweep_columns(sweep, points, actor_ids))
+    columns: dict[str, Any] = dict(sweep_columns(sweep, points, actor_ids))
+    np.savez_compressed(content, **columns)
     write_whole(path, content.getvalue())
 
 

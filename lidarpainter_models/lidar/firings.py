@@ -216,7 +216,7 @@ def _seen_by(
     )
 
 
-def _upright(seen_m: Sequence[Float[np.ndarray, "points 3"]]) -> Float[np.ndarray, "3 3"]:
+def _upright(seen_m: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "3 3"]:
     """The turn `lidar_from_sensor` under which elevations fall onto the sharpest lines.
 
     Sharpness is the sum of squared counts of elevations; it is climbed from coarse counts, which

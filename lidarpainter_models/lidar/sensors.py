@@ -163,7 +163,7 @@ def _checked(name: str, value: object, where: str) -> object:
         if all(_is_number(one) for one in value) and (name != "azimuths_deg" or len(value) == 2):
             return tuple(float(one) for one in value)
     elif _is_number(value) and name not in lists and name not in ("name", "steps", "turns_left"):
-        return float(value)
+        return float(str(value))
     raise ConfigError(f"{where}: {name} cannot be {str(value)[:40]!r} of a sensor")
 
 

@@ -76,7 +76,7 @@ def test_answers_are_blended_front_to_back(backend):
     assert met.nearest.item() == 1
     assert met.channels.item() == pytest.approx(0.6 * 2 + 0.24 * 1)
     assert met.cosine.item() == pytest.approx(0.84)
-    assert met.hits.index.tolist() == [[1, 0, -1]]
+    assert met.hits.row.tolist() == [[1, 0, -1]]
     assert met.hits.response[0].tolist() == pytest.approx([1, 1, 0])
     assert met.hits.slope[0].tolist() == pytest.approx([1, 1, 0])
 
@@ -125,7 +125,7 @@ def test_numba_meets_what_torch_meets(count, seed):
     rays, exact = random_rays(900, seed + 10), random_rays(900, seed + 10, torch.float64)
     expected = trace_rays(exact, random_solids(count, seed, torch.float64), most_hits=8)
     met = trace_rays(rays, random_solids(count, seed), most_hits=8, backend="cpu")
-    assert torch.equal(met.hits.index, expected.hits.index)
+    assert torch.equal(met.hits.row, expected.hits.row)
     assert torch.equal(met.nearest, expected.nearest)
     # float32 against float64, at up to forty metres
     pairs = zip(met[:5], expected[:5], strict=True)

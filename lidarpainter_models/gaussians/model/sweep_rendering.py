@@ -18,6 +18,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.ray_gaussians import (
+    BLENDED,
     Ellipsoids,
     RayHits,
     RayReturns,
@@ -82,9 +83,10 @@ def trace_sweep(
     rows = torch.cat([piece.rows for piece in pieces])
     back = torch.empty_like(rows)
     back[rows] = torch.arange(len(rows))
-    *columns, hits = zip(*found, strict=True)
+    hits = [one.hits for one in found]
+    rest = {name: torch.cat([getattr(one, name) for one in found])[back] for name in BLENDED}
     return RayReturns(
-        *(torch.cat(column)[back] for column in columns),
+        **rest,
         hits=RayHits(*(torch.cat(column)[back] for column in zip(*hits, strict=True))),
     )
 

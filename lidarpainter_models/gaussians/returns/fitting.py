@@ -213,7 +213,7 @@ class _Learnt:
     ) -> tuple[MetSurfaces, Float[Tensor, "rays hits"], Float[Tensor, "rays hits"]]:
         """What rays met, and the weight and range of every answer; differentiable."""
         weight = blended_hits(hits, torch.sigmoid(self.opacity_logit))
-        index = hits.index.clamp(min=0)
+        index = hits.row.clamp(min=0)
         slope = hits.slope.clamp(-STEEPEST, STEEPEST)
         range_m = hits.range_m + slope * self.offset_m[index]
         alpha = weight.sum(dim=1)

@@ -39,12 +39,12 @@ def surfels_of(
         The surfels, and the ids of the actors that bodies 1, 2, ... are.
     """
     points = gather_points(scene, frames)
-    parts = {None: points.street, **points.actors}
+    parts = [points.street, *points.actors.values()]
     clouds = [
         Cloud.of(
             part, SPACING * part.range_m, torch.ones(len(part), dtype=torch.bool), LEAST_VOXEL_M
         )
-        for part in parts.values()
+        for part in parts
     ]
     sets = []
     for body, voxels in enumerate(adaptive_voxels(clouds, budget=most)):

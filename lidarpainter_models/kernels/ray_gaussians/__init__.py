@@ -56,9 +56,9 @@ class Ellipsoids:
 
 
 class RayHits(NamedTuple):
-    """The nearest answers of every ray, front to back; rows that hold none have index -1."""
+    """The nearest answers of every ray, front to back; places that hold none have row -1."""
 
-    index: Int[Tensor, "rays hits"]
+    row: Int[Tensor, "rays hits"]
     response: Float[Tensor, "rays hits"]
     """Density at the answer over that at the centre; times opacity it is what stops there."""
     range_m: Float[Tensor, "rays hits"]
@@ -85,6 +85,10 @@ class RayReturns(NamedTuple):
     """Row of the Gaussian at the median, or `NOTHING`."""
     hits: RayHits
     """As many as were asked for."""
+
+
+BLENDED = tuple(name for name in RayReturns._fields if name != "hits")
+"""What has one row for each ray."""
 
 
 def trace_rays(
@@ -120,8 +124,8 @@ def blended_hits(
     opacity: Float[Tensor, " gaussians"],
 ) -> Float[Tensor, "rays hits"]:
     """How much of each ray every listed answer stops; differentiable in the opacities."""
-    is_there = hits.index >= 0
-    alpha = opacity[hits.index.clamp(min=0)] * hits.response * is_there
+    is_there = hits.row >= 0
+    alpha = opacity[hits.row.clamp(min=0)] * hits.response * is_there
     alpha = alpha.clamp(max=MOST_OPAQUE)
     through = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)

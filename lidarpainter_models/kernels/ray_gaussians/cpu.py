@@ -6,6 +6,7 @@ order and ends where it is stopped.
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -117,7 +118,7 @@ def _tile_of(
     return tile
 
 
-_INNER = {"fastmath": {"contract"}, "error_model": "numpy", "forceinline": True}
+_INNER: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "forceinline": True}
 _INNER |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 

@@ -18,10 +18,10 @@ def trace_rays(rays: Rays, gaussians: Ellipsoids, most_hits: int) -> RayReturns:
         _traced(Rays(*columns), gaussians, most_hits)
         for columns in zip(*(column.split(count) for column in rays), strict=True)
     ]
-    *columns, hits = zip(*parts, strict=True)
+    hits = [part.hits for part in parts]
+    rest = {name: torch.cat([getattr(part, name) for part in parts]) for name in rules.BLENDED}
     return RayReturns(
-        *(torch.cat(column) for column in columns),
-        hits=RayHits(*(torch.cat(column) for column in zip(*hits, strict=True))),
+        **rest, hits=RayHits(*(torch.cat(column) for column in zip(*hits, strict=True)))
     )
 
 
@@ -33,11 +33,11 @@ def _traced(rays: Rays, gaussians: Ellipsoids, most_hits: int) -> RayReturns:
     through = 1 - weight.cumsum(dim=1)
     weight = weight * (through + weight >= rules.LEFT_OVER)
     alpha = weight.sum(dim=1)
-    index = sorted_hits.index.clamp(min=0)
+    index = sorted_hits.row.clamp(min=0)
     range_m = torch.where(weight > 0, sorted_hits.range_m, 0.0)
     half, place = _first(through < 0.5)
     kept = [column[:, :most_hits] for column in sorted_hits]
-    padding = (0, max(most_hits - sorted_hits.index.shape[1], 0))
+    padding = (0, max(most_hits - sorted_hits.row.shape[1], 0))
     fill = (-1, 0, 0, 0, 0)
     padded = (torch.nn.functional.pad(*pair) for pair in zip(kept, [padding] * 5, strict=True))
     is_listed = torch.nn.functional.pad(weight[:, :most_hits] > 0, padding)
@@ -47,7 +47,7 @@ def _traced(rays: Rays, gaussians: Ellipsoids, most_hits: int) -> RayReturns:
         alpha=alpha,
         cosine=(weight * sorted_hits.cosine).sum(dim=1),
         channels=torch.einsum("rh,rhc->rc", weight, gaussians.channels[index]),
-        nearest=torch.where(half, _at(sorted_hits.index, place), rules.NOTHING),
+        nearest=torch.where(half, _at(sorted_hits.row, place), rules.NOTHING),
         hits=RayHits(
             *(torch.where(is_listed, *pair) for pair in zip(padded, map(_like, fill), strict=True))
         ),
@@ -94,7 +94,7 @@ def _answers(rays: Rays, gaussians: Ellipsoids) -> RayHits:
     rows = torch.arange(len(gaussians.means), device=direction.device).expand_as(response)
     cosine: Float[Tensor, "rays gaussians"] = (direction @ normal.T).abs()
     return RayHits(
-        index=torch.where(is_met, rows, -1),
+        row=torch.where(is_met, rows, -1),
         response=torch.where(is_met, response, 0.0),
         range_m=torch.where(is_met, range_m, torch.inf),
         slope=torch.where(is_met, slope, 0.0),

@@ -8,11 +8,12 @@ Gaussian make between the rays.
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 
-INSIDE: dict[str, bool] = {"nogil": True}
+INSIDE: dict[str, Any] = {"nogil": True}
 TURN_RAD, RIGHT_RAD = 2 * math.pi, math.pi / 2
 SLACK_RAD = 2e-5
 """What float32 leaves of angles."""
