@@ -77,8 +77,11 @@ class LidarEvaluation:
                 _Judged.of(rays, channel.simulated(fitted, rays), moving, channel.full_intensity)
             )
             progress(done, len(sweeps))
+        told = _by_protocol(judged)
+        if not self.lidar.tells_lost:
+            told["ray_drop_accuracy"] = None
         return {
-            "neurad-studio": _by_protocol(judged),
+            "neurad-studio": told,
             "own": dict(_own(judged)),
             "lidar": self.lidar.name,
             "num_sweeps": len(sweeps),
@@ -142,7 +145,7 @@ def _moving(rays: SweepRays, boxes: MovingBoxes) -> Bool[Tensor, " rays"]:
     return found
 
 
-def _by_protocol(judged: list[_Judged]) -> dict[str, float]:
+def _by_protocol(judged: list[_Judged]) -> dict[str, float | None]:
     """Means over sweeps of each sweep's figures."""
     rows = []
     for one in judged:

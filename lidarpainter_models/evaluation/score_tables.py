@@ -10,6 +10,7 @@ NEURAD = "neurad"
 """Entry of an evaluation by the protocol of neurad-studio, by camera."""
 LIDAR = "lidar"
 """Entry of an evaluation that judged simulated sweeps."""
+FEW_RAYS = "too few rays, or the log does not tell which were lost"
 ENVELOPE = "envelope"
 """Entry of the scores of a run: how far beside the path the scene can be trusted."""
 HELD_OUT = "held_out"
@@ -42,7 +43,7 @@ def metric_values(
         ]
     if LIDAR in scores:
         return [
-            (LIDAR, protocol, name, value, "too few rays" if value is None else None)
+            (LIDAR, protocol, name, value, FEW_RAYS if value is None else None)
             for protocol in ("neurad-studio", "own")
             for name, value in _numbers(scores[LIDAR][protocol])
         ]

@@ -47,6 +47,12 @@ def learnt(tmp_path_factory):
     return Learnt(tmp_path_factory.mktemp("store"))
 
 
+def usual_answer(learnt):
+    """Of how many rays it is right to say always that they come back, or never."""
+    share = learnt.rays().is_returned.double().mean().item()
+    return max(share, 1 - share)
+
+
 def test_held_out_sweeps_are_told_to_a_few_centimetres(learnt):
     evaluation = LidarEvaluation(scene=learnt.log, lidar=learnt.lidar, test_frames=TEST)
     scores = evaluation.scores(learnt.channel, learnt.scene)
@@ -54,7 +60,7 @@ def test_held_out_sweeps_are_told_to_a_few_centimetres(learnt):
     # a quick fit of a coarse sensor; the noise of a range is 2 cm
     assert scores["own"]["median_error_static_m"] < 0.06
     assert told["median_squared_depth_m2"] < 0.01
-    assert told["ray_drop_accuracy"] > 0.85
+    assert told["ray_drop_accuracy"] > usual_answer(learnt) + 0.05
     assert scores["num_sweeps"] == 2
 
 
@@ -92,7 +98,9 @@ def test_who_has_left_the_scene_is_met_no_more(learnt):
     left = learnt.channel.simulated(alone, rays)
     assert (met.body > 0).sum() > 20
     assert not (left.body > 0).any()
-    assert (left.range_m >= met.range_m - 1e-4)[met.body > 0].float().mean() > 0.9
+    uncovered = (met.body > 0) & (left.alpha > 0.5)
+    assert uncovered.any()
+    assert (left.range_m >= met.range_m - 1e-4)[uncovered].float().mean() > 0.9
 
 
 def test_who_has_come_into_the_scene_is_met_and_throws_a_shadow(learnt):
