@@ -1,5 +1,7 @@
 """What a LiDAR would measure in a finished run: judged, or written; without a server."""
 
+import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +11,14 @@ from flows.parameters import view_parameters
 from lidarpainter_models.evaluation.score_tables import LIDAR
 from lidarpainter_models.export.simulated_sweeps import SweepRequest
 from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.lidar.firings import mounted_lidar
+from lidarpainter_models.lidar.sensors import PRESETS, LidarSensor
+from lidarpainter_models.storage.whole_files import write_whole
 from tasks.evaluation.views import load_scores
-from tasks.lidar.channel import learn_lidar
+from tasks.lidar.channel import learn_lidar, lidar_of
 from tasks.lidar.evaluate import evaluate_lidar
 from tasks.lidar.render import render_sweeps
+from tasks.opened import open_scene
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, lineage, open_run
 from tasks.specs import RunSpec
@@ -80,3 +86,52 @@ def evaluate_lidar_run(store: Store, run: str, *, lidar_name: str | None = None)
         "protocol": LIDAR,
         LIDAR: found[LIDAR],
     }
+
+
+def sensor_of_scene(
+    store: Store, scene_id: str, lidar_name: str | None, out: Path | None
+) -> dict[str, Any]:
+    """Estimate the sensor of a scene's LiDAR from its sweeps; nothing is taken from a data sheet.
+
+    Returns:
+        `sensor` (its name), `num_beams`, `elevation_deg` from the highest beam to the lowest,
+        `steps`, `turn_s`, `lean_deg`, `tells_lost`, and `nearest_preset` with the largest
+        difference of its elevations where one has as many beams.
+
+    Raises:
+        SceneError: there is no such scene or LiDAR, or its sweeps do not tell its beams.
+        WriteError: the disk refuses.
+    """
+    scene = open_scene(store, scene_id)
+    lidar = mounted_lidar(scene, lidar_of(scene, lidar_name), knows_sheets=False)
+    sensor = lidar.sensor
+    if out is not None:
+        write_whole(out, (json.dumps(sensor.to_record(), indent=1) + "\n").encode("utf-8"))
+    up = lidar.lidar_from_sensor[:3, 2]
+    return {
+        "sensor": sensor.name,
+        "num_beams": sensor.num_beams,
+        "elevation_deg": list(sensor.elevation_deg),
+        "steps": sensor.steps,
+        "turn_s": sensor.turn_s,
+        "lean_deg": [round(math.degrees(math.asin(float(one))), 3) for one in up[:2]],
+        "tells_lost": lidar.tells_lost,
+        **_nearest_preset(sensor),
+        **({} if out is None else {"path": str(out)}),
+    }
+
+
+def _nearest_preset(sensor: LidarSensor) -> dict[str, Any]:
+    """The preset of as many beams whose elevations differ least, and by how much at most."""
+    apart = {
+        name: max(
+            abs(one - other)
+            for one, other in zip(sensor.elevation_deg, known.elevation_deg, strict=True)
+        )
+        for name, known in PRESETS.items()
+        if known.num_beams == sensor.num_beams
+    }
+    if not apart:
+        return {"nearest_preset": None}
+    name = min(apart, key=lambda one: apart[one])
+    return {"nearest_preset": name, "most_apart_deg": round(apart[name], 3)}

@@ -29,6 +29,7 @@ from flows.cli import (
     export,
     fleet,
     ingest,
+    lidar_model,
     measure,
     painter,
     reconstruct,
@@ -99,6 +100,7 @@ app.command("export")(export.export)
 app.command("drive")(drive.drive)
 app.command("check-bundle")(bundle.check_bundle)
 app.command("stylize")(stylize.stylize)
+app.command("lidar-model")(lidar_model.lidar_model)
 app.command("edit")(edit.edit)
 app.command("view")(view.view)
 app.command("serve")(serve.serve)

@@ -126,13 +126,18 @@ def _render_lidar(
     as_json: bool,
 ) -> None:
     """Write sweeps in place of images."""
+    from lidarpainter_models.export.formats import SWEEP_ENDINGS
+    from lidarpainter_models.lidar.sensors import read_sensor
+
+    if file_format not in SWEEP_ENDINGS:
+        raise ConfigError(f"--lidar-format {file_format!r}: expected {', '.join(SWEEP_ENDINGS)}")
+    sensor = None if lidar == "log" else read_sensor(lidar)
     from lidarpainter_models.export.simulated_sweeps import SweepRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from lidarpainter_models.lidar.sensors import read_sensor
 
     request = SweepRequest(
         trajectory=parse_trajectory(trajectory),
-        sensor=None if lidar == "log" else read_sensor(lidar),
+        sensor=sensor,
         frames=frames,
         file_format=file_format,
     )

@@ -14,6 +14,9 @@ FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "simulated",
 """What a format holds: the fitted scene, recorded images with poses, views along a trajectory, a
 page that plays the drive, recorded LiDAR sweeps, simulated ones, or all that a simulator loads."""
 
+SWEEP_ENDINGS = {"pcd": ".pcd", "pcd.bin": ".pcd.bin", "npz": ".npz", "parquet": ".parquet"}
+"""How the file of a simulated sweep ends, by the word for its format."""
+
 _WHERE = ("--trajectory", "--camera", "--frames", "--width")
 _WHEN = ("--time", "--actors", "--sky")
 

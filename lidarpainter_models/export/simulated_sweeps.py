@@ -8,6 +8,7 @@ import torch
 
 from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.export.formats import SWEEP_ENDINGS
 from lidarpainter_models.export.lidar_files import (
     write_npz,
     write_parquet,
@@ -23,9 +24,6 @@ from lidarpainter_models.lidar.sensors import LidarSensor
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Sweep, SweepPoints
 
-ENDINGS = {"pcd": ".pcd", "pcd.bin": ".pcd.bin", "npz": ".npz", "parquet": ".parquet"}
-"""How the file of a sweep ends, by the word for its format."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
@@ -39,15 +37,15 @@ class SweepRequest:
     """The log's LiDAR in whose place it is; None is the first."""
     frames: slice | None = None
     file_format: str = "pcd"
-    """One of `ENDINGS`."""
+    """One of `SWEEP_ENDINGS`."""
     seed: int | None = 0
     """Draws noise and what is lost; None takes what is likelier."""
 
     def __post_init__(self) -> None:
         """Refuse a format that nobody writes."""
-        if self.file_format not in ENDINGS:
+        if self.file_format not in SWEEP_ENDINGS:
             raise ConfigError(
-                f"format {self.file_format!r} of sweeps, expected {', '.join(ENDINGS)}"
+                f"format {self.file_format!r} of sweeps, expected {', '.join(SWEEP_ENDINGS)}"
             )
 
 

@@ -77,7 +77,7 @@ class MountedLidar:
 
     def rays(self, timestamp_ns: int) -> SweepRays:
         """All rays of a sweep around a time, which nothing has sent back."""
-        directions, after_s, beam = self.sensor.sweep()
+        directions, after_s, beam = map(torch.from_numpy, self.sensor.sweep())
         times_ns = timestamp_ns + (after_s * 1e9).round().long()
         columns_ns = times_ns[:: self.sensor.num_beams]
         poses = self.world_from_sensor(columns_ns)
@@ -86,9 +86,15 @@ class MountedLidar:
 
 
 def mounted_lidar(
-    scene: DrivingScene, lidar_name: str, frames: Sequence[int] | None = None
+    scene: DrivingScene,
+    lidar_name: str,
+    frames: Sequence[int] | None = None,
+    *,
+    knows_sheets: bool = True,
 ) -> MountedLidar:
     """What is known of a LiDAR of a scene, the rest estimated from sweeps of some frames.
+
+    With `knows_sheets` a LiDAR that is called as a preset has the beams of its data sheet.
 
     Raises:
         SceneError: there is no such LiDAR, or its sweeps do not tell its beams.
@@ -110,7 +116,7 @@ def mounted_lidar(
     seen = [replace(one, points_m=one.points_m @ turn) for one in seen]  # by the transpose
     lidar_from_sensor = torch.eye(4, dtype=torch.float64)
     lidar_from_sensor[:3, :3] = torch.from_numpy(turn)
-    sensor, are_apart = preset_of(lidar_name), True
+    sensor, are_apart = preset_of(lidar_name) if knows_sheets else None, True
     if sensor is None:
         beams_deg, are_apart = beam_elevations(seen)
         sensor = estimated_sensor(lidar_name, seen, beams_deg, scene)

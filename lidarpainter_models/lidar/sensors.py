@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float, Int
 
 from lidarpainter_models.errors import ConfigError
 
@@ -112,7 +110,9 @@ class LidarSensor:
             [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1
         )
 
-    def sweep(self) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, " rays"], Tensor]:
+    def sweep(
+        self,
+    ) -> tuple[Float[np.ndarray, "rays 3"], Float[np.ndarray, " rays"], Int[np.ndarray, " rays"]]:
         """All rays of a sweep, step after step.
 
         Returns:
@@ -123,7 +123,7 @@ class LidarSensor:
         beam = np.tile(np.arange(self.num_beams), self.steps)
         after_s = ((step + 0.5) / self.steps - 0.5) * self.turn_s
         directions = self.directions(beam, self.head_azimuth_deg(step))
-        return torch.from_numpy(directions), torch.from_numpy(after_s), torch.from_numpy(beam)
+        return directions, after_s, beam
 
     def to_record(self) -> dict[str, Any]:
         """What a sensor file holds."""

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from catalog.artefacts import ArtefactRef
+from lidarpainter_models.export.formats import SWEEP_ENDINGS
 from lidarpainter_models.export.simulated_sweeps import (
-    ENDINGS,
     SweepRequest,
     simulated_sweeps,
     write_sweep,
@@ -43,7 +43,7 @@ def render_sweeps(
     rows = []
     with new_folder(out) as folder:
         for done, written in enumerate(made, start=1):
-            ending = ENDINGS[request.file_format]
+            ending = SWEEP_ENDINGS[request.file_format]
             name = f"{sensor.name}/{written.sweep.frame_index:04d}{ending}"
             write_sweep(folder / name, written, request.file_format)
             rows.append(sweep_record(name, written.sweep))

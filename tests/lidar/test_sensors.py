@@ -35,7 +35,7 @@ def test_presets_have_the_beams_of_their_names():
 def test_a_turn_begins_behind_and_goes_to_the_right():
     sensor = LidarSensor(name="two", elevation_deg=(0.0, 30.0), steps=4)
     directions, after_s, beam = sensor.sweep()
-    first, second = directions[0].numpy(), directions[3].numpy()
+    first, second = directions[0], directions[3]
     assert first == pytest.approx([-np.sqrt(0.5), np.sqrt(0.5), 0])  # behind, to the left
     assert second == pytest.approx([np.sqrt(0.375), np.sqrt(0.375), 0.5])
     assert beam.tolist() == [0, 1] * 4

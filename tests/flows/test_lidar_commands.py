@@ -1,0 +1,92 @@
+"""Simulated sweeps of a run: judged, written, and the sensor of its log."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from commands import refuse, succeed
+from pyarrow import parquet
+from tiny_street import SCENE
+
+from flows import lidar
+from lidarpainter_models.gaussians.returns.settings import LidarConfig
+
+QUICK = partial(
+    LidarConfig, num_surfels=5000, steps=20, rays_per_step=2048, rays_per_sweep=4000, hits=12
+)
+COLUMNS = {"x", "y", "z", "intensity", "ring", "return", "timestamp_ns", "actor"}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(lidar, "LidarConfig", QUICK)
+
+
+def test_held_out_sweeps_judge_a_run_and_enter_the_catalog(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--protocol", "lidar")
+    result = succeed(*words, "--json", store=tiny_run.store).json
+    figures = result["lidar"]["neurad-studio"]
+    assert set(figures) == {
+        *("median_squared_depth_m2", "intensity_rmse", "ray_drop_accuracy", "chamfer_m2")
+    }
+    rows = [row for row in tiny_run.store.tables.rows("metrics") if row["protocol"] == "lidar"]
+    entered = {(row["trajectory"], row["name"]): row["value"] for row in rows}
+    name = "ray_drop_accuracy"
+    assert entered["neurad-studio", name] == pytest.approx(figures[name])
+    assert "median_error_static_m" in succeed(*words, store=tiny_run.store).out
+
+
+def test_sweeps_of_another_sensor_are_written_beside_the_path(tiny_run, tmp_path):
+    words = ("--trajectory", "lateral:1", "--lidar", "vlp-16", "--frames", "1:3")
+    where = ("--lidar-format", "npz", "--out", tmp_path / "s", "--json")
+    result = succeed("render", tiny_run.run_id, *words, *where, store=tiny_run.store).json
+    assert (result["sensor"], result["num_sweeps"]) == ("vlp-16", 2)
+    index = json.loads((tmp_path / "s" / "sweeps.json").read_text())
+    with np.load(tmp_path / "s" / index["sweeps"][0]["file"]) as found:
+        assert set(found.files) == COLUMNS
+        assert len(found["x"]) == index["sweeps"][0]["num_points"] > 500
+        assert found["ring"].max() <= 15
+        elevation = np.degrees(np.arctan2(found["z"], np.hypot(found["x"], found["y"])))
+        assert np.abs(elevation).max() < 15.5  # within a sweep the car drives on a little
+
+
+def test_sweeps_of_the_log_are_exported_as_parquet(tiny_run, tmp_path):
+    words = ("export", tiny_run.run_id, "--format", "sweeps", "--frames", "2:3")
+    succeed(*words, "--out", tmp_path / "s", store=tiny_run.store)
+    index = json.loads((tmp_path / "s" / "sweeps.json").read_text())
+    assert index["simulated"] is True
+    table = parquet.read_table(tmp_path / "s" / index["sweeps"][0]["file"])
+    assert set(table.column_names) == COLUMNS
+
+
+def test_the_sensor_of_a_log_is_estimated_and_its_file_taken(tiny_run, tmp_path):
+    path = tmp_path / "own.json"
+    found = succeed("lidar-model", SCENE, "--out", path, "--json", store=tiny_run.store).json
+    assert (found["num_beams"], found["steps"], found["tells_lost"]) == (32, 720, True)
+    words = ("--trajectory", "recorded", "--lidar", path, "--frames", "1:2")
+    where = ("--lidar-format", "pcd.bin", "--out", tmp_path / "s")
+    succeed("render", tiny_run.run_id, *words, *where, store=tiny_run.store)
+    (written,) = (tmp_path / "s").rglob("*.pcd.bin")
+    assert written.stat().st_size % 20 == 0
+
+
+RENDER = ("render", "latest", "--trajectory", "recorded", "--out", "x")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((*RENDER, "--lidar", "sonar"), "sensor 'sonar': expected hdl-32e"),
+        ((*RENDER, "--lidar", "gone.json"), "gone.json: cannot be read as a sensor"),
+        ((*RENDER, "--lidar", "log", "--lidar-format", "las"), "'las': expected pcd"),
+        ((*RENDER, "--lidar", "log", "--video"), "--video"),
+        ((*RENDER, "--lidar-format", "npz"), "--lidar-format needs --lidar"),
+        (("evaluate", "latest", "--protocol", "lidar", "--postpaint"), "--postpaint"),
+        (("evaluate", "latest", "--protocol", "lidar", "--all-views"), "--all-views"),
+        (("lidar-model", SCENE, "--lidar", "roof"), "LiDAR 'roof' is needed"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(tiny_run, tmp_path, monkeypatch, words, expected):
+    monkeypatch.chdir(tmp_path)
+    assert expected in refuse(*words, store=tiny_run.store)
