@@ -1,7 +1,8 @@
 """`lidarpainter render`: images of a run along a trajectory."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +18,9 @@ from flows.cli.shared_options import (
     with_told_collisions,
 )
 from lidarpainter_models.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lidarpainter_models.export.view_requests import ViewRequest
 
 WORDS = """
 out: Folder that the images are written to.
@@ -35,7 +39,8 @@ lidar_format: Files of the sweeps: pcd, pcd.bin, npz or parquet; the last two ho
 """
 
 OF_IMAGES = ("--camera", "--width", "--painter", "--previous", "--fps", "--beside")
-"""The options that sweeps have no use for, beside flags."""
+FLAGS_OF_IMAGES = ("--postpaint", "--video", "--depth", "--semantics", "--prompt")
+"""The options that sweeps have no use for."""
 
 
 @described(WORDS)
@@ -78,18 +83,11 @@ def render(  # noqa: PLR0913 - the options of a command
     run_id = checked_words(run, trajectory, painter)
     if lidar is not None:
         given = (camera, width, painter, previous, fps, beside)
-        values = dict(zip(OF_IMAGES, given, strict=True))
-        flags = {"--postpaint": postpaint, "--video": video, "--depth": depth}
-        flags |= {"--semantics": semantics, "--prompt": prompt != "clear"}
-        said = {name: value is not None for name, value in values.items()}
-        refuse_unused("--lidar", said | flags)
+        _refuse_of_images(given, (postpaint, video, depth, semantics, prompt != "clear"))
         _render_lidar(run_id, trajectory, lidar, lidar_format, followed, out, as_json=as_json)
         return
     if lidar_format != "pcd":
         raise ConfigError("--lidar-format needs --lidar")
-    from catalog.store import existing_store
-    from flows.cli.progress import shown_progress
-    from flows.views import render_run
     from lidarpainter_models.conditioning.settings import SequenceConfig
     from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
@@ -107,12 +105,27 @@ def render(  # noqa: PLR0913 - the options of a command
         beside=beside,
         kinds=ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps),
     )
+    _render_images(run_id, request, out, as_json=as_json)
+
+
+def _render_images(run: str, request: "ViewRequest", out: Path, *, as_json: bool) -> None:
+    """Write images along a trajectory."""
+    from catalog.store import existing_store
+    from flows.cli.progress import shown_progress
+    from flows.views import render_run
+
     with shown_progress():
-        result = render_run(existing_store(), run_id, request, out.absolute())
+        result = render_run(existing_store(), run, request, out.absolute())
     if as_json:
         print_json(result)
     else:
         print_pairs(f"images of {result['scene']}", with_told_collisions(result))
+
+
+def _refuse_of_images(given: Sequence[object], flags: Sequence[bool]) -> None:
+    """Refuse what is said of images where sweeps are asked for, in the order of the options."""
+    said = {name: value is not None for name, value in zip(OF_IMAGES, given, strict=True)}
+    refuse_unused("--lidar", said | dict(zip(FLAGS_OF_IMAGES, flags, strict=True)))
 
 
 def _render_lidar(

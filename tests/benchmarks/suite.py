@@ -30,6 +30,7 @@ from bench_raster import (
     reference_figures,
     thread_figures,
 )
+from bench_rays import ray_figures
 from bench_records import Figure, baseline_of, kept_to, table, write_figures
 from bench_twins import twin_figures
 from rich.console import Console
@@ -79,6 +80,7 @@ def measure(*, quick):
             *frame_growth_figures(1, blocks=(1, 2), **small),
             *memory_figures(**small),
             *point_figures(machine, 1, counts=(1000, 2000)),
+            *ray_figures(machine, 1, num_gaussians=500, keep_every=50),
         ]
     return [
         *machine.figures(),
@@ -88,6 +90,7 @@ def measure(*, quick):
         *iteration_figures(machine, 15),
         *twin_figures(15),
         *point_figures(machine, 9),
+        *ray_figures(machine, 7),
         *growth_figures(3),
         *frame_growth_figures(48),
         *memory_figures(),

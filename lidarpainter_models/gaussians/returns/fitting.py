@@ -74,41 +74,53 @@ def fit_lidar(
     surfels, placed = surfels.select(kept), in_scene[kept].to(surfels.body_index)
     if not len(surfels):
         raise SceneError(f"{scene.path.name}: the sweeps of its training frames met nothing")
-    learnt = _Learnt.start(surfels, config.seed)
     rays = _joined(sweeps)
-    brightest = float(rays.intensity.max())
-    full = 255.0 if brightest > 1.0 else 1.0
+    full = 255.0 if float(rays.intensity.max()) > 1.0 else 1.0
     target = _Target(
         range_m=rays.range_m.float(),
         is_returned=rays.is_returned,
         intensity=(rays.intensity / full).clamp(0, 1),
     )
+    learnt = _Learnt.start(surfels, config.seed)
+
+    def met() -> RayHits:
+        return learnt.met(fitted, placed, sweeps, config.hits)
+
+    hits = _learn(learnt, met, target, config, progress)
+    return LidarChannel(
+        surfels=learnt.surfels_now(),
+        actor_ids=actor_ids,
+        strength=learnt.strength.detach(),
+        drop=learnt.drop.detach(),
+        heads=learnt.heads.requires_grad_(requires_grad=False),
+        noise_m=learnt.noise(hits, target),
+        full_intensity=full,
+    )
+
+
+def _learn(
+    learnt: "_Learnt",
+    met: Callable[[], RayHits],
+    target: "_Target",
+    config: LidarConfig,
+    progress: Callable[[int, int], None],
+) -> RayHits:
+    """Take all steps; returns what the rays have met last."""
     random = torch.Generator().manual_seed(config.seed)
-    optimiser = learnt.optimiser()
-    hits = learnt.met(fitted, placed, sweeps, config.hits)
+    optimiser, hits = learnt.optimiser(), met()
     for step in range(config.steps):
-        if step == config.steps // 2:
-            hits = learnt.met(fitted, placed, sweeps, config.hits)
+        if step > 0 and step == config.steps // 2:
+            hits = met()
         if step == int(SLOW_FROM * config.steps):
             for group in optimiser.param_groups:
                 group["lr"] *= SLOWER
-        rows = torch.randint(len(rays), (config.rays_per_step,), generator=random)
+        rows = torch.randint(len(target.range_m), (config.rays_per_step,), generator=random)
         own = RayHits(*(column[rows] for column in hits))
         optimiser.zero_grad(set_to_none=True)
         learnt.loss(own, target.select(rows)).backward()
         optimiser.step()
         progress(step + 1, config.steps)
-    noise_m = learnt.noise(hits, target)
-    moved = replace(learnt.surfels_now(), body_index=surfels.body_index)
-    return LidarChannel(
-        surfels=moved,
-        actor_ids=actor_ids,
-        strength=learnt.strength.detach(),
-        drop=learnt.drop.detach(),
-        heads=learnt.heads.requires_grad_(requires_grad=False),
-        noise_m=noise_m,
-        full_intensity=full,
-    )
+    return hits
 
 
 def _sweeps(
