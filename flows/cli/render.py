@@ -75,8 +75,7 @@ def render(  # noqa: PLR0913 - the options of a command
 
     A film: lidarpainter render latest --trajectory lateral:2 --video --beside recorded --out p
     """
-    if fps is not None and not video:
-        raise ConfigError("--fps needs --video")
+    _check_needs(fps is not None and not video, lidar_format != "pcd" and lidar is None)
     sequences, followed = parse_previous(previous), parse_frames(frames)
     if len(sequences) > 1:
         raise ConfigError(f"--previous {previous!r}: expected one of them here")
@@ -86,8 +85,6 @@ def render(  # noqa: PLR0913 - the options of a command
         _refuse_of_images(given, (postpaint, video, depth, semantics, prompt != "clear"))
         _render_lidar(run_id, trajectory, lidar, lidar_format, followed, out, as_json=as_json)
         return
-    if lidar_format != "pcd":
-        raise ConfigError("--lidar-format needs --lidar")
     from lidarpainter_models.conditioning.settings import SequenceConfig
     from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
@@ -106,6 +103,14 @@ def render(  # noqa: PLR0913 - the options of a command
         kinds=ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps),
     )
     _render_images(run_id, request, out, as_json=as_json)
+
+
+def _check_needs(is_fps_alone: bool, is_format_alone: bool) -> None:
+    """Refuse what says something of what is not asked for."""
+    if is_fps_alone:
+        raise ConfigError("--fps needs --video")
+    if is_format_alone:
+        raise ConfigError("--lidar-format needs --lidar")
 
 
 def _render_images(run: str, request: "ViewRequest", out: Path, *, as_json: bool) -> None:

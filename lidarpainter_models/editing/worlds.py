@@ -164,7 +164,9 @@ class EditedWorld:
             gaussians=own.append(coming),
             actors=actors.with_rigid(moving),
         )
-        points = {**self.lidar_map.actors, track.actor_id: model.points}
+        # of its own: a copy of somebody here would share tensors, which a file cannot hold twice
+        its_points = model.points.keep(torch.arange(len(model.points)))
+        points = {**self.lidar_map.actors, track.actor_id: its_points}
         lidar_map = LidarMap(street=self.lidar_map.street, actors=points)
         return replace(self, scene=scene, lidar_map=lidar_map)
 
