@@ -43,6 +43,19 @@ def _waymo() -> Reader:
     return Reader(list_waymo_segments, WaymoLog)
 
 
+def _av2() -> Reader:
+    from lidarpainter_models.readers.av2.reader import Av2Log, list_av2_logs
+
+    return Reader(list_av2_logs, Av2Log)
+
+
+def _kitti() -> Reader:
+    from lidarpainter_models.readers.kitti.drives import list_kitti_drives
+    from lidarpainter_models.readers.kitti.reader import KittiLog
+
+    return Reader(list_kitti_drives, KittiLog)
+
+
 def _canonical() -> Reader:
     from lidarpainter_models.readers.canonical.reader import ForeignScene, list_canonical_scenes
 
@@ -53,6 +66,8 @@ _READERS: dict[str, Callable[[], Reader]] = {
     "pandaset": _pandaset,
     "nuscenes": _nuscenes,
     "waymo": _waymo,
+    "av2": _av2,
+    "kitti": _kitti,
     CANONICAL: _canonical,
 }
 

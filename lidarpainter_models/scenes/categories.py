@@ -4,11 +4,11 @@ import re
 
 _CATEGORIES = {
     "bicycle rack": {"rack"},
-    "pedestrian": {"pedestrian", "human", "person"},
-    "animal": {"animal", "animals"},
     "sign": {"sign", "signs"},
+    "pedestrian": {"pedestrian", "human", "person", "signaler"},
+    "animal": {"animal", "animals", "dog"},
     "barrier": {"barrier", "barriers"},
-    "cone": {"cone", "cones", "trafficcone", "pylon", "pylons"},
+    "cone": {"cone", "cones", "trafficcone", "pylon", "pylons", "barrel"},
     "motorcycle": {"motorcycle", "motorcyclist", "motorized", "scooter", "moped"},
     "bicycle": {"bicycle", "bicyclist", "cyclist"},
     "pickup": {"pickup"},
@@ -16,14 +16,15 @@ _CATEGORIES = {
     "trailer": {"trailer", "towed"},
     "truck": {"truck"},
     "bus": {"bus"},
-    "train": {"train", "tram", "subway", "trolley"},
+    "train": {"train", "tram", "subway", "trolley", "railed"},
     "construction vehicle": {"construction"},
     "emergency vehicle": {"emergency", "ambulance", "police"},
     "car": {"car"},
     "vehicle": {"vehicle"},
 }
 """Categories by the words that say so; the first that has one of them counts, so `pedestrian` of
-`human.pedestrian.police_officer`, and `pickup` of `Pickup Truck`. Waymo says no more than
+`human.pedestrian.police_officer`, `sign` of `MOBILE_PEDESTRIAN_SIGN`, and `pickup` of `Pickup
+Truck`. Waymo says no more than
 `vehicle`."""
 
 

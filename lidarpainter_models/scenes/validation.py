@@ -16,7 +16,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
-from lidarpainter_models.scenes.image_bytes import can_decode
+from lidarpainter_models.scenes.image_bytes import MAX_IMAGE_PIXELS, can_decode
 from lidarpainter_models.scenes.records import Distortion, RollingShutter
 from lidarpainter_models.scenes.schema import MAX_NAME_LENGTH, is_safe_name
 from lidarpainter_models.scenes.undistortion import pinhole_of
@@ -34,11 +34,6 @@ MIN_UPRIGHT = math.cos(math.radians(45.0))
 """Cosine between the ego's z and the world's; no road is as steep."""
 MAX_BOX_M = 1000.0
 """Along a side; a train is shorter."""
-MAX_IMAGE_PIXELS = 64_000_000
-"""A header that states more is refused before anything is decoded; cameras have up to 12 million.
-
-A progressive JPEG keeps six bytes per pixel while it is decoded.
-"""
 MAX_LABEL_LENGTH = 200
 MAX_PLACE_M = 1e8
 """The Earth's radius is 6.4e6 m; frames of datasets are often centred far away."""
@@ -199,7 +194,7 @@ def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
     """
     if jpeg.startswith(_PNG_START):
         raise DataError(
-            f"{where}: a PNG image, expected JPEG: convert it, as docs/examples/kitti_raw.py does"
+            f"{where}: a PNG image, expected JPEG: convert it, as docs/examples/nerfstudio.py does"
         )
     if not jpeg.startswith(_JPEG_START):
         raise DataError(f"{where}: not a JPEG image")

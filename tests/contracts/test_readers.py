@@ -142,7 +142,7 @@ def test_root_without_a_log_is_refused(log, tmp_path):
 
 def test_a_missing_file_is_refused_in_one_line_unless_nothing_is_read_from_it(log, scene, tmp_path):
     num_refused = 0
-    files = log.files()
+    files = [file for file in log.files() if log.is_listed(file)]
     for number, file in enumerate(files[:: max(len(files) // 5, 1)]):
         damaged = log.copied(tmp_path / f"log-{number}")
         (damaged.root / file.relative_to(log.root)).unlink()

@@ -74,7 +74,7 @@ def refused(words, expected, place):
         (("demo", "--seed", "9999"), "'--seed': Input should be less than or equal to 999"),
         (("ingest", "pandaset", "{root}", "--jobs", "0"), "greater than or equal to 1"),
         # ingest
-        (("ingest", "kitti", "{root}"), "'kitti' is not known, expected one of pandaset, nuscenes"),
+        (("ingest", "lyft", "{root}"), "'lyft' is not known, expected one of pandaset, nuscenes"),
         (("ingest", "pandaset", "{tmp}/gone"), "no such folder, expected the root of pandaset"),
         (("ingest", "pandaset", "{file}"), "no such folder, expected the root of pandaset"),
         (("ingest", "nuscenes", "{tmp}/empty"), "no nuscenes sequence found"),
@@ -230,7 +230,7 @@ def refused(words, expected, place):
         # doctor
         (("doctor", "nonsense"), "is no scene id, expected dataset/sequence such as"),
         (("doctor", "toy/other"), "ingest it first"),
-        (("doctor", "kitti", "{root}"), "'kitti' is not known, expected one of"),
+        (("doctor", "lyft", "{root}"), "'lyft' is not known, expected one of"),
         (("doctor", "pandaset", "{tmp}/gone"), "no such folder, expected the root of pandaset"),
         (("doctor", "pandaset", "{root}/{sequence}"), "use its parent {root}"),
         (("doctor", TOY_SCENE, "--out", "{file}/x.png"), "cannot write {file}/x.png"),

@@ -154,8 +154,8 @@ def test_sequences_are_listed(sound_pandaset, tmp_path):
     assert list_sequences("pandaset", sound_pandaset.root) == ("002",)
     with pytest.raises(DataError, match="no pandaset sequence"):
         list_sequences("pandaset", tmp_path)
-    with pytest.raises(DataError, match="'kitti' is not known, expected one of pandaset"):
-        list_sequences("kitti", tmp_path)
+    with pytest.raises(DataError, match="'lyft' is not known, expected one of pandaset"):
+        list_sequences("lyft", tmp_path)
 
 
 def test_actor_seen_by_the_forward_lidar_alone_keeps_its_track(pandaset, tmp_path):

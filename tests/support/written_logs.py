@@ -5,10 +5,12 @@ A reader joins by an entry in `WRITERS`; the contract says so when one is missin
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from av2_log import LOG, street_like_av2, write_av2_log
 from drawn_streets import drawn_street
+from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
 from nuscenes_log import SCENE_NAME, reduced, street_like_nuscenes, write_nuscenes_log
 from small_pandaset import PandasetFolder
 from waymo_components import write_v2
@@ -18,7 +20,12 @@ from waymo_truth import street_config, write_truth
 
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigLidar
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,12 @@ class WrittenLog:
     dataset: str
     root: Path
     sequence: str
+    unlisted: tuple[str, ...] = ()
+    """Parts of paths of files that no other file names: one that is gone was never recorded."""
+
+    def is_listed(self, file):
+        """Whether something else in the log says that a file is there."""
+        return not any(part in str(file.relative_to(self.root)) for part in self.unlisted)
 
     def ingest(self, store, **options):
         return ingest_scene(self.dataset, self.root, self.sequence, store, **options)
@@ -38,7 +51,7 @@ class WrittenLog:
     def copied(self, root):
         """The same log elsewhere, free to be damaged."""
         shutil.copytree(self.root, root)
-        return WrittenLog(self.dataset, root, self.sequence)
+        return replace(self, root=root)
 
     def files(self):
         return sorted(path for path in self.root.rglob("*") if path.is_file())
@@ -48,6 +61,40 @@ def _pandaset(folder: Path) -> WrittenLog:
     log = PandasetFolder(folder / "pandaset")
     log.write_log()
     return WrittenLog("pandaset", log.root, log.sequence)
+
+
+def _av2(folder: Path) -> WrittenLog:
+    write_av2_log(street_like_av2(folder / "street"), folder / "av2")
+    unlisted = ("sensors/", "map/", "annotations.feather")
+    return WrittenLog("av2", folder / "av2", LOG, unlisted)
+
+
+def _kitti_raw(folder: Path) -> WrittenLog:
+    write_kitti_raw(_street_like_kitti(folder), folder / "kitti")
+    unlisted = ("velodyne_points/", "timestamps.txt", "tracklet_labels.xml")
+    return WrittenLog("kitti", folder / "kitti", DRIVE, unlisted)
+
+
+def _kitti_tracking(folder: Path) -> WrittenLog:
+    write_kitti_tracking(_street_like_kitti(folder), folder / "kitti")
+    return WrittenLog("kitti", folder / "kitti", SEQUENCE, ("velodyne/", "label_02/"))
+
+
+def _street_like_kitti(folder: Path) -> DrivingScene:
+    cameras = tuple(
+        RigCamera(name=f"image_0{number}", focal_per_width=0.6, left_m=left_m)
+        for number, left_m in ((2, 0.06), (3, -0.48))
+    )
+    config = SyntheticStreetConfig(
+        seed=5,
+        num_frames=3,
+        width_px=96,
+        height_px=54,
+        samples_per_axis=1,
+        cameras=cameras,
+        lidar=RigLidar(beams=32, columns=360),
+    )
+    return DrivingScene.open(record_street(drawn_street(config), folder / "street"))
 
 
 def _canonical(folder: Path) -> WrittenLog:
@@ -83,6 +130,9 @@ WRITERS: dict[str, Callable[[Path], WrittenLog]] = {
     "nuscenes": _nuscenes,
     "waymo, version 1": lambda folder: _waymo(folder, write_v1),
     "waymo, version 2": lambda folder: _waymo(folder, write_v2),
+    "av2": _av2,
+    "kitti, raw": _kitti_raw,
+    "kitti, tracking": _kitti_tracking,
     "canonical": _canonical,
 }
 """Writes a log into a folder, by what it is called in tests: the dataset, and its version."""

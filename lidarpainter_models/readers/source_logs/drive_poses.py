@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import (
@@ -15,22 +15,30 @@ from lidarpainter_models.geometry.transforms import (
 )
 
 NS_PER_S = 1_000_000_000
+MIN_UNIT, MAX_UNIT = 0.99, 1.01
+"""Length of a quaternion that a log may state; it is rounded to a few digits."""
 
 
 def pose_at(
     global_from_body: Float[Tensor, "frames 4 4"], timestamps_ns: list[int], timestamp_ns: int
 ) -> Float[Tensor, "4 4"]:
     """A pose between the recorded ones; before the first and after the last the motion goes on."""
+    return poses_at(global_from_body, np.array(timestamps_ns), np.array([timestamp_ns]))[0]
+
+
+def poses_at(
+    global_from_body: Float[Tensor, "frames 4 4"],
+    timestamps_ns: Int64[np.ndarray, " frames"],
+    queries_ns: Int64[np.ndarray, " queries"],
+) -> Float[Tensor, "queries 4 4"]:
+    """Poses between the recorded ones, whose times ascend; beyond their ends the motion goes on."""
     if len(timestamps_ns) == 1:
-        return global_from_body[0]
-    after = int(np.clip(np.searchsorted(timestamps_ns, timestamp_ns), 1, len(timestamps_ns) - 1))
+        return global_from_body.expand(len(queries_ns), 4, 4)
+    after = np.searchsorted(timestamps_ns, queries_ns).clip(1, len(timestamps_ns) - 1)
     start_ns, end_ns = timestamps_ns[after - 1], timestamps_ns[after]
-    fraction = (timestamp_ns - start_ns) / (end_ns - start_ns)
-    return interpolate_rigid(
-        global_from_body[after - 1],
-        global_from_body[after],
-        torch.tensor(fraction, dtype=torch.float64),
-    )
+    fraction = torch.from_numpy((queries_ns - start_ns) / (end_ns - start_ns))
+    rows = torch.from_numpy(after)
+    return interpolate_rigid(global_from_body[rows - 1], global_from_body[rows], fraction)
 
 
 def level_frame(global_from_ego: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -51,7 +59,7 @@ def stated_pose(
 ) -> Float[Tensor, "4 4"] | None:
     """The pose that a log states, float64; None where the rotation is no unit quaternion."""
     rotation = torch.tensor(rotation_wxyz, dtype=torch.float64)
-    if not 0.99 < float(rotation.norm()) < 1.01:
+    if not MIN_UNIT < float(rotation.norm()) < MAX_UNIT:
         return None
     translation = torch.tensor(translation_m, dtype=torch.float64)
     return rigid_from_rotation(rotation_from_quaternion(rotation), translation)

@@ -4,14 +4,20 @@ A sweep takes 0.1 s, in which a car drives metres. A box holds when its LiDAR sa
 median time of the points inside it, or of those in its direction.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds, turned_about_up
+from lidarpainter_models.geometry.boxes import count_points_in_boxes
+from lidarpainter_models.readers.source_logs.drive_poses import (
+    NS_PER_S,
+    nanoseconds,
+    turned_about_up,
+)
 from lidarpainter_models.scenes.records import BoxRecord
 from lidarpainter_models.scenes.tracks import does_move
 
@@ -162,3 +168,64 @@ def _moves(boxes: list[tuple[float, SourceBox]]) -> bool:
     duration_s = float(times_s.max() - times_s.min())
     is_marked = any(not box.is_stationary for _, box in boxes)
     return is_marked and duration_s > 0 and travelled_m / duration_s >= MOVING_MPS
+
+
+def seen_records(
+    boxes: Sequence[BoxRecord],
+    xyz_world_m: Float[Tensor, "points 3"],
+    offset_ns: np.ndarray,
+    origin_ns: int,
+    lidar_world_m: np.ndarray,
+) -> list[BoxRecord]:
+    """Boxes of a sweep, each with its points counted and the time at which a LiDAR saw it.
+
+    Args:
+        boxes: where each stands in the world; their times and counts are replaced.
+        xyz_world_m: the points of the sweep.
+        offset_ns: when each was measured, after `origin_ns`.
+        origin_ns: a time near them.
+        lidar_world_m: where the LiDAR is.
+    """
+    if not boxes or not len(xyz_world_m):
+        return list(boxes)
+    xyz_m = xyz_world_m.double().numpy()
+    of_one = np.full(len(xyz_m), SPINNING)
+    times = SweepTimes(xyz_m, offset_ns / NS_PER_S, of_one, lidar_world_m)
+    poses = torch.stack([box.world_from_box for box in boxes])
+    counts = count_points_in_boxes(
+        xyz_world_m, poses, torch.tensor([box.size_m for box in boxes])
+    ).tolist()
+    seen = []
+    for box, count in zip(boxes, counts, strict=True):
+        upright = _upright(box)
+        offset_s = times.time_of(upright, times.inside(upright))
+        time_ns = origin_ns + round(offset_s * NS_PER_S)
+        seen.append(replace(box, timestamp_ns=time_ns, num_points=count))
+    return seen
+
+
+def with_motion(frames: Mapping[int, Sequence[BoxRecord]]) -> dict[int, list[BoxRecord]]:
+    """The boxes of a log by frame, each told whether its actor moves at any time (`does_move`)."""
+    places_m: dict[str, list[Tensor]] = {}
+    for boxes in frames.values():
+        for box in boxes:
+            places_m.setdefault(box.actor_id, []).append(box.world_from_box[:3, 3])
+    moving = {name for name, places in places_m.items() if does_move(torch.stack(places))}
+    return {
+        frame: [replace(box, is_moving=box.actor_id in moving) for box in boxes]
+        for frame, boxes in frames.items()
+    }
+
+
+def _upright(box: BoxRecord) -> SourceBox:
+    """The box without its lean, which is some degrees: enough to tell when it was seen."""
+    pose = box.world_from_box
+    return SourceBox(
+        actor_id=box.actor_id,
+        category=box.category,
+        sensor=SPINNING,
+        centre_m=pose[:3, 3].numpy(),
+        yaw_rad=float(torch.atan2(pose[1, 0], pose[0, 0])),
+        size_m=box.size_m,
+        is_stationary=not box.is_moving,
+    )
