@@ -34,6 +34,7 @@ from flows.cli import (
     painter,
     reconstruct,
     render,
+    rig,
     serve,
     settings,
     stylize,
@@ -93,6 +94,7 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("doctor")(doctor.doctor)
 app.command("ingest")(ingest.ingest)
+app.command("rig")(rig.rig)
 app.command("reconstruct")(reconstruct.reconstruct)
 app.command("settings")(settings.settings)
 app.command("render")(render.render)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from lidarpainter_models.errors import DataError
+from lidarpainter_models.errors import ConfigError, DataError
 
 if TYPE_CHECKING:  # which datasets there are is known without them: a mistyped one costs nothing
     from lidarpainter_models.readers.source_logs.log import Progress, SourceLog
@@ -21,8 +21,11 @@ class Reader(NamedTuple):
 
     list_sequences: Callable[[Path], tuple[str, ...]]
     """The sequences below a root, by name."""
-    open_log: "Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]"
-    """Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
+    open_log: "Callable[..., SourceLog]"
+    """Takes the root, the sequence, and which frames and cameras to take, all of them if None; of a
+    dataset whose files say no rig that too, None for the one that is proposed."""
+    is_file: bool = False
+    """Whether a root may be a file, and a rig belongs to it."""
 
 
 def _pandaset() -> Reader:
@@ -56,6 +59,13 @@ def _kitti() -> Reader:
     return Reader(list_kitti_drives, KittiLog)
 
 
+def _mcap() -> Reader:
+    from lidarpainter_models.readers.bags.chunks import list_bags
+    from lidarpainter_models.readers.bags.reader import BagLog
+
+    return Reader(list_bags, BagLog, is_file=True)
+
+
 def _canonical() -> Reader:
     from lidarpainter_models.readers.canonical.reader import ForeignScene, list_canonical_scenes
 
@@ -68,6 +78,7 @@ _READERS: dict[str, Callable[[], Reader]] = {
     "waymo": _waymo,
     "av2": _av2,
     "kitti": _kitti,
+    "mcap": _mcap,
     CANONICAL: _canonical,
 }
 
@@ -84,7 +95,7 @@ def list_sequences(dataset: str, root: Path) -> tuple[str, ...]:
         DataError: the dataset is not known, or the root is no folder or holds no sequence.
     """
     reader = _reader(dataset)
-    if not Path(root).is_dir():
+    if not Path(root).is_dir() and not (reader.is_file and Path(root).is_file()):
         raise DataError(f"{root}: no such folder, expected the root of {dataset}")
     found = reader.list_sequences(Path(root))
     if not found:
@@ -134,19 +145,25 @@ def open_log(
     *,
     frames: slice | None = None,
     cameras: tuple[str, ...] | None = None,
+    rig: Path | None = None,
 ) -> "SourceLog":
     """Open one sequence of a dataset.
 
     The root is the folder as downloaded. Frames are taken by position, cameras by name; None takes
-    all.
+    all. A rig says which topics of a bag are which sensor (bags/rig.py).
 
     Raises:
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.
+        ConfigError: the rig cannot be read, or the dataset takes none.
     """
     from lidarpainter_models.scenes.validation import require_name
 
     reader = _reader(dataset)
     require_name(sequence, "sequence")
+    if reader.is_file:
+        return reader.open_log(Path(root), sequence, frames, cameras, rig)
+    if rig is not None:
+        raise ConfigError(f"{rig}: a map is for mcap, the files of {dataset} say their own rig")
     return reader.open_log(Path(root), sequence, frames, cameras)
 
 

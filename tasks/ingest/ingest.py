@@ -10,7 +10,8 @@ from typing import Any
 import lidarpainter_models
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.readers import ingest_scene, scene_id_of
+from lidarpainter_models.readers import open_log, scene_id_of
+from lidarpainter_models.readers.source_logs.log import write_log
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from lidarpainter_models.synthetic.street import WORLD_VERSION
 from tasks.ingest.bucket_roots import root_at_hand
@@ -32,6 +33,7 @@ def ingest_sequence(
     sequence: str,
     frames: slice | None = None,
     cameras: tuple[str, ...] | None = None,
+    rig: Path | None = None,
 ) -> dict[str, Any]:
     """Read one sequence of a dataset into the store; returns its row in `scenes`."""
     store = open_store(store_path)
@@ -40,13 +42,10 @@ def ingest_sequence(
         root_at_hand(root, sequence) as folder,
         writing(store, scene_id_of(dataset, folder, sequence)),
     ):
-        path = ingest_scene(
-            dataset,
-            folder,
-            sequence,
+        log = open_log(dataset, folder, sequence, frames=frames, cameras=cameras, rig=rig)
+        path = write_log(
+            log,
             store.root,
-            frames=frames,
-            cameras=cameras,
             progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
         )
     return record_scene(store, path)

@@ -33,6 +33,8 @@ from tasks.opened import open_scene
 from tasks.progress import listener
 
 STAGE = "sequences"
+MAX_RIG = 1_000_000
+"""Characters of a map that are noted; a longer one is refused when it is read."""
 WAIT = "wait"
 """In place of a stage: another process brings the scene in."""
 
@@ -46,6 +48,8 @@ class IngestRequest:
     root: Path
     frames: slice | None = None
     cameras: tuple[str, ...] | None = None
+    rig: Path | None = None
+    """Of a bag: which topic is which sensor; as proposed if None."""
 
     def key(self) -> dict[str, Any]:
         """What must be equal for an earlier answer to hold, JSON-able."""
@@ -54,6 +58,7 @@ class IngestRequest:
             "root": normal_root(self.root),
             "frames": None if frames is None else [frames.start, frames.stop],
             "cameras": None if self.cameras is None else list(self.cameras),
+            "rig": None if self.rig is None else self.rig.read_text("utf-8", "replace")[:MAX_RIG],
             "software_version": lidarpainter_models.__version__,
         }
 
@@ -144,7 +149,8 @@ def sole_reader(store: Store, scene_id: str) -> Iterator[None]:
 def _read(request: IngestRequest, name: str) -> dict[str, Any]:
     """Read a sequence and note it; returns its row."""
     row = ingest_sequence.fn(
-        request.store_path, request.dataset, request.root, name, request.frames, request.cameras
+        *(request.store_path, request.dataset, request.root, name),
+        *(request.frames, request.cameras, request.rig),
     )
     notes, note = _notes(request), json.dumps({"request": request.key(), "row": row}).encode()
     noted = notes.read(f"{name}.json")
@@ -172,7 +178,7 @@ def _known(request: IngestRequest, name: str) -> dict[str, Any] | None:
         return None
     if stored["content_digest"] != digest:
         earlier = {}  # nothing is noted of the scene that is there, but it has its cameras
-    there = {**asked, **earlier, "cameras": sorted(stored["camera_names"])}
+    there = {**asked, "rig": None, **earlier, "cameras": sorted(stored["camera_names"])}
     if asked["cameras"] is None and earlier.get("cameras") is None:
         there["cameras"] = None
     differing = [what for what, say in WORDS.items() if say(there[what]) != say(asked[what])]
@@ -191,6 +197,7 @@ WORDS: dict[str, Callable[[Any], str]] = {
     "cameras": lambda names: f"cameras {', '.join(sorted(set(names)))}" if names else "all cameras",
     "frames": _frames,
     "root": lambda root: f"root {root}",
+    "rig": lambda text: f"a map of {len(text.splitlines())} lines" if text else "no map",
 }
 """How a choice is said, part by part; choices that are said alike are the same."""
 

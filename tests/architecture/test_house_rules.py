@@ -14,7 +14,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 LAZY = {"open3d", "diffusers", "transformers", "peft", "gsplat", "gsply", "grpc", "pxr", "av"}
 MAX_LINES = 350
 MAX_FUNCTION_LINES = 60
-WHOLE = ("dev", "diffusion", "docs", "export", "simulators")
+WHOLE = ("bags", "dev", "diffusion", "docs", "export", "simulators")
 """Extras that a checkout has."""
 COMPILED = ("lidarpainter_models/kernels/", "lidarpainter_models/synthetic/raytracing/")
 """A compiled loop may stand in one long function."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from av2_log import LOG, street_like_av2, write_av2_log
+from bag_log import write_foxglove_bag, write_ros_bag
 from drawn_streets import drawn_street
 from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
 from nuscenes_log import SCENE_NAME, reduced, street_like_nuscenes, write_nuscenes_log
@@ -97,6 +98,11 @@ def _street_like_kitti(folder: Path) -> DrivingScene:
     return DrivingScene.open(record_street(drawn_street(config), folder / "street"))
 
 
+def _bag(folder: Path, write: Callable[..., object]) -> WrittenLog:
+    write(street_like_av2(folder / "street"), folder / "bags/drive.mcap")
+    return WrittenLog("mcap", folder / "bags", "drive")
+
+
 def _canonical(folder: Path) -> WrittenLog:
     scene = _pandaset(folder).ingest(folder / "store")
     return WrittenLog("canonical", scene.parent, scene.name)
@@ -133,6 +139,8 @@ WRITERS: dict[str, Callable[[Path], WrittenLog]] = {
     "av2": _av2,
     "kitti, raw": _kitti_raw,
     "kitti, tracking": _kitti_tracking,
+    "mcap, ROS 2": lambda folder: _bag(folder, write_ros_bag),
+    "mcap, Foxglove": lambda folder: _bag(folder, write_foxglove_bag),
     "canonical": _canonical,
 }
 """Writes a log into a folder, by what it is called in tests: the dataset, and its version."""

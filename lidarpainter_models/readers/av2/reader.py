@@ -240,6 +240,7 @@ class Av2Log:
         camera = Camera(
             world_from_camera=world_from_ego @ recorded.ego_from_camera,
             **recorded.intrinsics,
+            shutter=None,
             width_px=recorded.width_px,
             height_px=recorded.height_px,
         )
