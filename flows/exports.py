@@ -18,6 +18,7 @@ from tasks.exports.sweeps import export_sweeps
 from tasks.exports.views import export_images, export_video
 from tasks.runs import FinishedRun, lineage, open_run
 from tasks.views.drive import write_page
+from tasks.views.render import ViewedRun
 
 
 def export_run(
@@ -48,6 +49,10 @@ def export_run(
             f"({finished.change['kind']}): export {first.derived_from or first.run_id}, "
             "which it was derived from"
         )
+    if row.kind == "page" and (request.is_painted or request.beside is not None):
+        raise ConfigError(
+            "a browser shows the scene itself: --postpaint and --beside are not for it"
+        )
     made = _export(store, finished, row, request, scene or SceneRequest(), out)
     return {"run_id": finished.run_id, "scene": finished.scene_id, "format": row.name, **made}
 
@@ -61,10 +66,6 @@ def _export(
     out: Path,
 ) -> dict[str, Any]:
     """Hand a format to the stage that writes its kind."""
-    if row.kind == "page" and (request.is_painted or request.beside is not None):
-        raise ConfigError(
-            "a browser shows the scene itself: --postpaint and --beside are not for it"
-        )
     viewed = viewed_run(store, finished, request)
     match row.kind:
         case "scene":
@@ -83,12 +84,19 @@ def _export(
         case "bundle":
             return export_bundle(viewed.run, finished, envelope_of(store, finished), row, out)
         case "views":
-            kinds = ViewKinds(
-                images=False,
-                depth=row.name == "depth",
-                semantics=row.name == "semantics",
-                video=row.name == "video",
-                fps=request.kinds.fps,
-            )
-            task = export_video if kinds.video else export_images
-            return task(viewed, replace(request, kinds=kinds), out)
+            return _export_views(viewed, row, request, out)
+
+
+def _export_views(
+    viewed: ViewedRun, row: ExportFormat, request: ViewRequest, out: Path
+) -> dict[str, Any]:
+    """Write images or a film of the kind that a format is named by."""
+    kinds = ViewKinds(
+        images=False,
+        depth=row.name == "depth",
+        semantics=row.name == "semantics",
+        video=row.name == "video",
+        fps=request.kinds.fps,
+    )
+    task = export_video if kinds.video else export_images
+    return task(viewed, replace(request, kinds=kinds), out)

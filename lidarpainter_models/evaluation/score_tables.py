@@ -35,30 +35,8 @@ def metric_values(
     have shifted paths alone, those by the protocol of neurad-studio cameras, and those of sweeps
     figures by whose protocol they are.
     """
-    if NEURAD in scores:
-        return [
-            (NEURAD, camera, name, value, values.get(f"{name}_reason"))
-            for camera, values in scores[NEURAD].items()
-            for name, value in _numbers(values)
-        ]
-    if LIDAR in scores:
-        return [
-            (LIDAR, protocol, name, value, FEW_RAYS if value is None else None)
-            for protocol in ("neurad-studio", "own")
-            for name, value in _numbers(scores[LIDAR][protocol])
-        ]
-    if FLICKER in scores:
-        return [
-            ("flicker", trajectory, name, value, None)
-            for trajectory, values in scores[FLICKER].items()
-            for name, value in _numbers(values)
-        ]
     if "recorded" not in scores:
-        return [
-            ("cross-camera", camera, name, value, values.get(f"{name}_reason"))
-            for camera, values in scores.items()
-            for name, value in _numbers(values)
-        ]
+        return _by_part(scores)
     found = []
     recorded = scores["recorded"]
     for name, value in _numbers(recorded):
@@ -70,6 +48,22 @@ def metric_values(
             protocol = "depth" if name.startswith("depth") else "truth"
             found.append((protocol, trajectory, name, value, _reason(values, name, value)))
     return [*found, *_trusted(scores.get(ENVELOPE))]
+
+
+def _by_part(
+    scores: Mapping[str, Any],
+) -> list[tuple[str, str, str, float | None, str | None]]:
+    """Numbers of what was not judged as held-out views are, by camera, path or protocol."""
+    name_of = next((name for name in (NEURAD, LIDAR, FLICKER) if name in scores), "cross-camera")
+    parts = dict(scores.get(name_of, scores))
+    if name_of == LIDAR:
+        parts = {name: parts[name] for name in ("neurad-studio", "own")}
+    few = FEW_RAYS if name_of == LIDAR else None
+    return [
+        (name_of, part, name, value, values.get(f"{name}_reason", few) if value is None else None)
+        for part, values in parts.items()
+        for name, value in _numbers(values)
+    ]
 
 
 def _trusted(

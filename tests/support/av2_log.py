@@ -7,6 +7,7 @@ Written from the devkit's description (av2, `datasets/sensor/README.md`), not fr
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -39,7 +40,7 @@ HALF_TURN_NS = 50_000_000
 
 def street_like_av2(store, **settings):
     """A street seen by two cameras and one LiDAR of 64 beams, far from the city's origin."""
-    chosen = {
+    chosen: dict[str, Any] = {
         "seed": 5,
         "num_frames": 3,
         "width_px": 96,

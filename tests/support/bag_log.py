@@ -390,8 +390,8 @@ def _foxglove_messages(bag, log_ns, kind, content):
         )
     elif kind == "sweep":
         start_ns, columns = bag.cloud(content)
-        of_ros = fox.PackedElementFieldNumericType
-        of_ros = {7: of_ros.Float32, 4: of_ros.Uint16, 6: of_ros.Uint32}
+        numeric = fox.PackedElementFieldNumericType
+        of_ros = {7: numeric.Float32, 4: numeric.Uint16, 6: numeric.Uint32}
         fields = [
             fox.PackedElementField(name=name, offset=at, type=of_ros[kind])
             for name, at, kind in (*POINT_FIELDS, ("x", 18, 7))

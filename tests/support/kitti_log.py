@@ -148,6 +148,7 @@ class _Drive:
             frame_index = self.scene.frame_indices[position]
             view = next(v for v in self.scene.views_of(own) if v.frame_index == frame_index)
             pixels = decode_image(bytes(self.scene.read_jpeg(view)))
+            assert pixels is not None
             _write(image(name), cv2.imencode(".png", pixels)[1].tobytes())
         _write(sweep, self.scan(position).tobytes())
 
