@@ -8,6 +8,7 @@ than the scene that is there was read with, fewer ones too, are refused: runs st
 was interrupted leaves nothing behind and starts again at its first frame.
 """
 
+import hashlib
 import json
 import multiprocessing
 import signal
@@ -33,8 +34,6 @@ from tasks.opened import open_scene
 from tasks.progress import listener
 
 STAGE = "sequences"
-MAX_RIG = 1_000_000
-"""Characters of a map that are noted; a longer one is refused when it is read."""
 WAIT = "wait"
 """In place of a stage: another process brings the scene in."""
 
@@ -58,7 +57,7 @@ class IngestRequest:
             "root": normal_root(self.root),
             "frames": None if frames is None else [frames.start, frames.stop],
             "cameras": None if self.cameras is None else list(self.cameras),
-            "rig": None if self.rig is None else self.rig.read_text("utf-8", "replace")[:MAX_RIG],
+            "rig": None if self.rig is None else hashlib.sha256(self.rig.read_bytes()).hexdigest(),
             "software_version": lidarpainter_models.__version__,
         }
 
@@ -197,7 +196,7 @@ WORDS: dict[str, Callable[[Any], str]] = {
     "cameras": lambda names: f"cameras {', '.join(sorted(set(names)))}" if names else "all cameras",
     "frames": _frames,
     "root": lambda root: f"root {root}",
-    "rig": lambda text: f"a map of {len(text.splitlines())} lines" if text else "no map",
+    "rig": lambda digest: f"the map {digest[:8]}" if digest else "no map",
 }
 """How a choice is said, part by part; choices that are said alike are the same."""
 

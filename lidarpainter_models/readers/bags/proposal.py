@@ -61,22 +61,24 @@ def proposed_rig(survey: BagSurvey) -> Proposal:
     where = str(survey.files[0])
     tree = tree_of(survey, None, where)
     missing: list[str] = []
-    cameras = _cameras(survey, missing)
-    lidars = _lidars(survey)
+    cameras, lidars = _cameras(survey, missing), _lidars(survey)
+    sensors: tuple[RigSensor, ...] = (*lidars, *cameras)
     if not lidars:
         missing.append("no topic with points of a LiDAR")
+    if not survey.of_kind("image", "video"):
+        missing.append("no topic with images of a camera")
+    frames = [survey.topics[sensor.topic].frame for sensor in sensors]
+    ego, world = _car_frame(tree, frames[0] if frames else "")
+    if frames and ego == world:
+        missing.append(f"no pose of the car: nothing moves {frames[0] or 'its sensors'} in a frame")
+    for sensor, frame in zip(sensors, frames, strict=True):
+        if not tree.are_tied(frame, ego):
+            missing.append(
+                f"frame {frame!r:.60} of {sensor.topic} is tied to nothing: [[transform]]"
+            )
+    clock = _clock(survey, sensors, missing)
     if not cameras:
-        return Proposal(rig=None, missing=(*missing, "no topic with images of a camera"))
-    first = lidars[0].topic if lidars else cameras[0].topic
-    frame = survey.topics[first].frame
-    ego, world = _car_frame(tree, frame)
-    if ego == world:
-        missing.append(f"no pose of the car: nothing moves {frame or 'its sensors'} in a frame")
-    for sensor in (*lidars, *cameras):
-        own = survey.topics[sensor.topic].frame
-        if not tree.are_tied(own, ego):
-            missing.append(f"frame {own!r:.60} of {sensor.topic} is tied to nothing: [[transform]]")
-    clock = _clock(survey, (*lidars, *cameras), missing)
+        return Proposal(rig=None, missing=tuple(missing))
     boxes = next((RigBoxes(topic=t.name) for t in survey.of_kind("boxes") if t.count), None)
     rig = BagRig(
         licence=LICENCE,

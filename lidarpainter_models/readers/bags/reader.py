@@ -280,7 +280,7 @@ class BagLog:
 
 def _around(
     known_ns: Int64[np.ndarray, " poses"], times_ns: Int64[np.ndarray, " points"]
-) -> Int64[np.ndarray, " poses"]:
+) -> Int64[np.ndarray, " kept"]:
     """The times of poses between which points were measured, two at least where there are."""
     if not len(times_ns):
         return known_ns[:1]

@@ -10,9 +10,10 @@ from mcap.writer import CompressionType
 from mutations import damaged_bytes
 
 from lidarpainter_models.errors import ConfigError, DataError, LidarPainterError
-from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.readers import ingest_scene, open_log
 from lidarpainter_models.readers.bags import chunks
 from lidarpainter_models.readers.bags.rig import read_rig
+from tasks.ingest.rigs import propose_rig
 
 
 def refusal(file, store):
@@ -88,7 +89,6 @@ def jumps(_writer, message, number):
 @pytest.mark.parametrize(
     ("topic", "change", "expected"),
     [
-        ("points", back_in_time, "clock"),
         ("camera_info", no_lens, "states no lens, the camera is not calibrated"),
         ("camera_info", other_size, "the image is 96 x 54 px, expected 97 x 54"),
         ("camera_info", odd_lens, "distortion 'ds', expected plumb_bob"),
@@ -104,6 +104,19 @@ def test_senseless_message(street, tmp_path, topic, change, expected):
     name = topic if topic != "tf" else "tf"
     file = changed(tmp_path / "drive.mcap", street, name, change)
     assert expected in refusal(file, tmp_path / "store")
+
+
+def test_clock_that_jumps_is_told_and_which_other_there_is(street, tmp_path):
+    file = changed(tmp_path / "drive.mcap", street, "points", back_in_time)
+    rig = tmp_path / "rig.toml"
+    proposed = propose_rig(file)["rig"]
+    assert 'clock = "log"' in proposed
+    rig.write_text(proposed.replace('clock = "log"', 'clock = "header"'))
+    with pytest.raises(DataError) as raised:
+        open_log("mcap", file, "drive", rig=rig)
+    line = str(raised.value)
+    assert "message 2 of /lidars/main_pandar64/points is stamped -1699999999" in line
+    assert line.endswith('expected a clock that goes on, or clock = "log" in the rig')
 
 
 def test_boxes_without_ids_are_not_proposed(street, tmp_path):

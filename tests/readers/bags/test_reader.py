@@ -3,6 +3,7 @@
 import io
 import os
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -140,7 +141,7 @@ def h264(street, camera):
     """The images of a camera with their packets, each a whole picture of a video."""
     codec = av.CodecContext.create("libx264", "w")
     codec.width, codec.height, codec.pix_fmt = 96, 54, "yuv420p"
-    codec.time_base, codec.options = "1/10", {"tune": "zerolatency", "crf": "5", "bf": "0"}
+    codec.time_base, codec.options = Fraction(1, 10), {"tune": "zerolatency", "crf": "5", "bf": "0"}
     views = street.views_of(camera)
     found = []
     for number, view in enumerate(views):
@@ -161,7 +162,9 @@ def test_recorders_clock_is_taken_where_headers_have_none(street, tmp_path):
     written(tmp_path / "bags/drive.mcap", BagScene(street), without_times)
     proposed = propose_rig(tmp_path / "bags/drive.mcap")
     assert 'clock = "log"' in proposed["rig"]
-    scene = read(tmp_path / "bags", "drive", tmp_path / "store")
+    rig = tmp_path / "rig.toml"  # sweeps reach the recorder 60 ms after they begin
+    rig.write_text(proposed["rig"].replace('point_time = "t"', 'point_time = "t"\nlate_s = -0.06'))
+    scene = read_as(tmp_path / "bags", "drive", rig, tmp_path / "store")
     assert [view.timestamp_ns for view in scene.views] == [v.timestamp_ns for v in street.views]
 
 
