@@ -10,10 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from catalog.store import Store
-from flows.views import viewed_run
+from flows.views import envelope_of, viewed_run
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import WriteError
-from lidarpainter_models.evaluation.score_tables import ENVELOPE
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.trajectory_words import RECORDED
@@ -22,7 +21,7 @@ from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.scene_pool import LoadedScene, ScenePool
 from lidarpainter_models.serving.server import grpc_server
 from lidarpainter_models.serving.servicer import SensorsimServicer, Told
-from tasks.runs import FinishedRun, lineage, open_run
+from tasks.runs import FinishedRun, open_run
 from tasks.serving.load import load_served
 
 COLUMNS = (
@@ -136,11 +135,9 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
             painter=request.painter,
         ),
     )
-    envelopes = (one.result.get(ENVELOPE) for one in lineage(store, run))
-    envelope = next((found for found in envelopes if found), None)
     return load_served(
         viewed,
-        envelope,
+        envelope_of(store, run),
         device=request.device,
         is_painted=request.is_painted,
         is_measured=request.is_measured,
