@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from catalog.artefacts import ArtefactRef
 from catalog.store import Store
+from flows.lidar import learnt_channel
+from flows.parameters import view_parameters
 from flows.views import envelope_of, viewed_run
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import WriteError
@@ -56,6 +59,8 @@ class ServeRequest:
     """Name of the painter; None takes each run's own."""
     is_measured: bool = True
     """Whether the confidence of every image is measured."""
+    has_lidar: bool = False
+    """Whether sweeps are answered; what the LiDAR of each log sees is learnt when it is loaded."""
     device: Device = "auto"
     most_bytes: int = 4_000_000_000
     """Of scenes in memory."""
@@ -125,6 +130,21 @@ def _pool(store: Store, finished: Sequence[FinishedRun], request: ServeRequest) 
     )
 
 
+def learn_lidars(store: Store, runs: Sequence[str]) -> None:
+    """Learn what the first LiDAR of each run's log sees, where that is not known yet.
+
+    Raises:
+        SceneError: a scene has no LiDAR.
+    """
+    for run in runs:
+        _lidar_of(store, open_run(store, run))
+
+
+def _lidar_of(store: Store, run: FinishedRun) -> ArtefactRef:
+    """What the first LiDAR of a run's log sees, learnt unless it is there."""
+    return learnt_channel(store, run, view_parameters(run).run_spec(store.address), None)
+
+
 def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
     viewed = viewed_run(
         store,
@@ -141,6 +161,7 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
         device=request.device,
         is_painted=request.is_painted,
         is_measured=request.is_measured,
+        lidar=_lidar_of(store, run) if request.has_lidar else None,
         name=run.run_id,
     )
 

@@ -20,6 +20,8 @@ serve.port: Port of gRPC; 0 takes a free one.
 http_port: Port of NeuroNCAP's routes, which show the first run; without it there are none.
 paint: Paint every image, in agreement with the one that the same client asked of the camera before.
 serve.painter: Painter of the images, which it paints without --paint too; the run's own if absent.
+lidar: Answer LiDAR sweeps too; what the LiDAR of each log sees is learnt first, which takes minutes
+  when it was not yet.
 memory: How much scenes in memory may take together, such as 4GB; the one that was asked for longest
   ago leaves.
 queue: How many requests may wait at a time; more are refused.
@@ -40,6 +42,7 @@ def serve(  # noqa: PLR0913 - the options of a command
     http_port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     paint: bool = False,
     painter: str | None = None,
+    lidar: bool = False,
     device: str = "auto",
     memory: str = "4GB",
     queue: Annotated[int, typer.Option(min=1, max=1000)] = 32,
@@ -62,17 +65,16 @@ def serve(  # noqa: PLR0913 - the options of a command
     run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
     check_painter(painter)
     from catalog.store import existing_store
-    from flows.serve import ServeRequest, serve_runs
+    from flows.cli.progress import shown_progress
+    from flows.serve import ServeRequest, learn_lidars, serve_runs
 
-    def opened_at(address: str, http_address: str | None) -> None:
-        clear_status()
-        for one in (address, http_address):
-            if one is not None:
-                sys.stdout.write(f"{one}\n")
-        sys.stdout.flush()
+    store = existing_store()
+    if lidar:
+        with shown_progress():
+            learn_lidars(store, run_ids)
 
     serve_runs(
-        existing_store(),
+        store,
         ServeRequest(
             runs=run_ids,
             host=host,
@@ -81,6 +83,7 @@ def serve(  # noqa: PLR0913 - the options of a command
             is_painted=paint or painter is not None,
             painter=painter,
             is_measured=trust,
+            has_lidar=lidar,
             device=device,
             most_bytes=most_bytes,
             most_waiting=queue,
@@ -92,3 +95,12 @@ def serve(  # noqa: PLR0913 - the options of a command
         opened_at=opened_at,
         stopped=threading.Event(),
     )
+
+
+def opened_at(address: str, http_address: str | None) -> None:
+    """Print where the server can be reached."""
+    clear_status()
+    for one in (address, http_address):
+        if one is not None:
+            sys.stdout.write(f"{one}\n")
+    sys.stdout.flush()

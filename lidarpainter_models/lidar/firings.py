@@ -82,7 +82,7 @@ class MountedLidar:
         columns_ns = times_ns[:: self.sensor.num_beams]
         poses = self.world_from_sensor(columns_ns)
         poses = poses.repeat_interleave(self.sensor.num_beams, dim=0)
-        return _unanswered(poses, directions, times_ns, beam)
+        return unanswered_rays(poses, directions, times_ns, beam)
 
 
 def mounted_lidar(
@@ -141,7 +141,7 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
     world_from_sensor = lidar.world_from_sensor(torch.from_numpy(seen.time_ns))
     direction = torch.from_numpy(seen.points_m / range_m[:, None])
     rows = torch.arange(len(range_m))
-    returned = _unanswered(
+    returned = unanswered_rays(
         world_from_sensor, direction, torch.from_numpy(seen.time_ns), torch.from_numpy(beam)
     )
     returned = replace(
@@ -153,7 +153,7 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
     if not lidar.tells_lost:
         return returned
     missing = _missing(seen, beam, sensor)
-    absent = _unanswered(
+    absent = unanswered_rays(
         lidar.world_from_sensor(torch.from_numpy(missing.time_ns)),
         torch.from_numpy(sensor.directions(missing.beam, missing.head_deg)),
         torch.from_numpy(missing.time_ns),
@@ -163,7 +163,7 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
     return SweepRays(**dict(zip(vars(returned), map(torch.cat, pairs), strict=True)))
 
 
-def _unanswered(
+def unanswered_rays(
     world_from_sensor: Tensor, directions: Tensor, times_ns: Tensor, beam: Tensor
 ) -> SweepRays:
     """Rays of the sensor's frame in the world; nothing came back."""

@@ -48,34 +48,45 @@ _ACROSS = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SensorRequest:
-    """One image that is asked for."""
+class TimedRequest:
+    """What is asked of a sensor for a span of time: where it is then, and who else is where."""
 
     scene_id: str
-    camera_name: str
-    """Whose exposure and own body it gets; may be a name that the scene does not know."""
-    camera: SensorCamera
-    """At the size that is asked for."""
     start_us: int
     end_us: int
-    """When the shutter opens and closes."""
-    across: tuple[float, float] = (0.0, 0.0)
-    """How much later the right end and the lower end are read, in readouts: 0, 1 or -1."""
+    """When the sensor begins to see and when it ends."""
     world_from_sensor: Float[Tensor, "2 4 4"]
     """At the start and at the end."""
     actor_ids: tuple[str, ...] = ()
     """Who is there; nobody else is."""
     world_from_actors: Float[Tensor, "actors 2 4 4"]
     """Their boxes at the start and at the end."""
-    own_body_of: str | None = None
-    """Camera whose view of the recording car is laid over the image."""
-    encoding: Encoding
 
     @property
     def middle_ns(self) -> int:
-        """When the middle of the image is read; an instant [t, t + 1) us is t."""
+        """The middle of the span; an instant [t, t + 1) us is t."""
         is_instant = self.end_us - self.start_us <= 1
         return self.start_us * 1000 if is_instant else (self.start_us + self.end_us) * 500
+
+    @property
+    def readout_s(self) -> float:
+        """How long what is there moves while the sensor sees it."""
+        return (self.end_us - self.start_us) * 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorRequest(TimedRequest):
+    """One image that is asked for, between the opening and the closing of its shutter."""
+
+    camera_name: str
+    """Whose exposure and own body it gets; may be a name that the scene does not know."""
+    camera: SensorCamera
+    """At the size that is asked for."""
+    across: tuple[float, float] = (0.0, 0.0)
+    """How much later the right end and the lower end are read, in readouts: 0, 1 or -1."""
+    own_body_of: str | None = None
+    """Camera whose view of the recording car is laid over the image."""
+    encoding: Encoding
 
     @property
     def readout_s(self) -> float:
@@ -109,43 +120,53 @@ def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRe
     """
     spec = message.camera_intrinsics
     width_px, height_px = checked_size(message, spec)
-    start_us, end_us = message.frame_start_us, message.frame_end_us
-    if end_us < start_us:
-        raise invalid(f"frame_end_us {end_us} lies before frame_start_us {start_us}")
-    if end_us - start_us > LONGEST_S * 1e6 or end_us >= 2**53:
-        raise invalid(
-            f"frame_start_us {start_us} to frame_end_us {end_us}: expected a shutter of at most "
-            f"{LONGEST_S:g} s"
-        )
     if spec.shutter_type not in _ACROSS:
         raise invalid(f"shutter_type {spec.shutter_type}: expected 0 to {len(_ACROSS) - 1}")
-    if len(message.dynamic_objects) > MOST_ACTORS:
-        raise invalid(
-            f"{len(message.dynamic_objects)} dynamic_objects: expected at most {MOST_ACTORS}"
-        )
     camera = sensor_camera(spec).resized(width_px, height_px)
     if camera.is_searched and width_px * height_px > MOST_SEARCHED:
         raise invalid(
             f"the request has {width_px} x {height_px} px through a lens whose rays are searched "
             f"for: expected at most {MOST_SEARCHED} px"
         )
-    ids = tuple(one.track_id for one in message.dynamic_objects)
-    pairs = [(f"dynamic object {one.track_id!r}", one.pose_pair) for one in message.dynamic_objects]
-    poses = _poses([("sensor_pose", message.sensor_pose), *pairs])
-    name = spec.logical_id
     return SensorRequest(
-        scene_id=message.scene_id,
-        camera_name=name,
+        **read_timed(message),
+        camera_name=spec.logical_id,
         camera=camera,
-        start_us=start_us,
-        end_us=end_us,
         across=_ACROSS[spec.shutter_type],
-        world_from_sensor=poses[0],
-        actor_ids=_each_once(ids),
-        world_from_actors=poses[1:],
         own_body_of=_own_body_of(message),
         encoding=encoding_of(message.image_format, message.image_quality),
     )
+
+
+def read_timed(message: Any) -> dict[str, Any]:  # noqa: ANN401  a request of any sensor
+    """What every request says of its span of time: the fields of a `TimedRequest`.
+
+    Raises:
+        RequestError: INVALID_ARGUMENT, with the field that makes no sense.
+    """
+    start_us, end_us = message.frame_start_us, message.frame_end_us
+    if end_us < start_us:
+        raise invalid(f"frame_end_us {end_us} lies before frame_start_us {start_us}")
+    if end_us - start_us > LONGEST_S * 1e6 or end_us >= 2**53:
+        raise invalid(
+            f"frame_start_us {start_us} to frame_end_us {end_us}: expected a span of at most "
+            f"{LONGEST_S:g} s"
+        )
+    if len(message.dynamic_objects) > MOST_ACTORS:
+        raise invalid(
+            f"{len(message.dynamic_objects)} dynamic_objects: expected at most {MOST_ACTORS}"
+        )
+    ids = tuple(one.track_id for one in message.dynamic_objects)
+    pairs = [(f"dynamic object {one.track_id!r}", one.pose_pair) for one in message.dynamic_objects]
+    poses = _poses([("sensor_pose", message.sensor_pose), *pairs])
+    return {
+        "scene_id": message.scene_id,
+        "start_us": start_us,
+        "end_us": end_us,
+        "world_from_sensor": poses[0],
+        "actor_ids": _each_once(ids),
+        "world_from_actors": poses[1:],
+    }
 
 
 def _own_body_of(message: Any) -> str | None:  # noqa: ANN401  an RGBRenderRequest

@@ -15,7 +15,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation, rigid_from_tangent
 from lidarpainter_models.scenes.tracks import ActorTrack
-from lidarpainter_models.serving.messages import SensorRequest, middle_of
+from lidarpainter_models.serving.messages import TimedRequest, middle_of
 from lidarpainter_models.serving.refusals import invalid
 
 PARKED_M = 1.0
@@ -65,7 +65,7 @@ def same_pose(first: Tensor, second: Tensor) -> Tensor:
 
 
 def placed_actors(
-    actors: Actors, parked: dict[str, ActorTrack], request: SensorRequest, taken_ns: int
+    actors: Actors, parked: dict[str, ActorTrack], request: TimedRequest, taken_ns: int
 ) -> Actors:
     """The actors of a scene as a request has them; as recorded, where it has them so.
 
@@ -120,7 +120,7 @@ def twists_of(pairs: Float[Tensor, "bodies 2 4 4"], span_s: float) -> Float[Tens
 def _check_strangers(
     rows_of: dict[str, int],
     parked: dict[str, ActorTrack],
-    request: SensorRequest,
+    request: TimedRequest,
     middle: Float[Tensor, "actors 4 4"],
     taken_ns: int,
 ) -> None:

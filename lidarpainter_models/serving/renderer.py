@@ -25,6 +25,7 @@ from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.gaussians.model.actors import PRESENCE_MARGIN_NS
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
+from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.side_by_side import both
@@ -34,7 +35,7 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
-from lidarpainter_models.serving.messages import SensorRequest
+from lidarpainter_models.serving.messages import SensorRequest, TimedRequest
 from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.placed_actors import (
     Moment,
@@ -79,6 +80,8 @@ class ServedScene:
     """Whether the confidence of frames is measured, which takes longer than to draw them."""
     streams: PaintedStreams | None = None
     """Paints images; None shows the scene as it is."""
+    returns: LidarChannel | None = None
+    """What the log's LiDAR sees of the scene; None answers no sweeps."""
     _lenses: OrderedDict[SensorCamera, LensImage] = field(default_factory=OrderedDict, init=False)
     _views: dict[str, tuple[tuple[RecordedView, ...], Tensor]] = field(
         default_factory=dict, init=False
@@ -161,7 +164,12 @@ class ServedScene:
         taken = view.camera if camera is None else camera
         return found_camera(self.scene, self.recorded, view, taken)
 
-    def _moment(self, request: SensorRequest) -> Moment:
+    def refuse_other_times(self, request: TimedRequest) -> None:
+        """Refuse a span of time of which the scene knows nothing.
+
+        Raises:
+            RequestError: OUT_OF_RANGE.
+        """
         first_us, last_us = self.time_range_us
         if request.start_us < first_us or request.end_us > last_us:
             raise RequestError(
@@ -169,6 +177,9 @@ class ServedScene:
                 f"frame_start_us {request.start_us} to frame_end_us {request.end_us}: scene "
                 f"{self.scene_id} was recorded from {first_us} to {last_us} us",
             )
+
+    def _moment(self, request: SensorRequest) -> Moment:
+        self.refuse_other_times(request)
         middle, shutter = request.world_from_middle, None
         if request.readout_s:
             twist = twists_of(request.world_from_sensor[None], request.readout_s)[0]

@@ -19,6 +19,11 @@ from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.refusals import Code, RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.scene_pool import ScenePool
+from lidarpainter_models.serving.served_sweeps import (
+    measured_points,
+    points_message,
+    read_sweep,
+)
 from lidarpainter_models.serving.trust import Trust, metadata
 from lidarpainter_models.serving.wire import MOST_BYTES, grpc_package
 
@@ -27,7 +32,7 @@ if TYPE_CHECKING:
 
 MOST_BYTES_KEY = "lidarpainter-max-reply-bytes"
 """Metadata of a request whose reply must not be larger: images become JPEGs as good as allowed."""
-MOST_ITEMS = 64
+MOST_ITEMS, MOST_SWEEPS = 64, 8
 """Of a batch."""
 API_VERSION = (0, 0, 5)
 Answer = TypeVar("Answer", bound=Callable[..., Any])
@@ -119,14 +124,18 @@ class SensorsimServicer:
 
     @answered
     def render_aggregated(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        if message.lidar_requests:
-            raise RequestError("UNIMPLEMENTED", "this server renders cameras, no LiDAR")
-        found = self._made(message.rgb_requests, context)
+        if len(message.lidar_requests) > MOST_SWEEPS:
+            raise invalid(f"{len(message.lidar_requests)} sweeps: expected at most {MOST_SWEEPS}")
+        asks_nothing = not message.lidar_requests and not message.rgb_requests
+        has_images = bool(message.rgb_requests) or asks_nothing
+        found = self._made(message.rgb_requests, context) if has_images else []
         refusals = [made.refusal for made in found if made.refusal is not None]
         if refusals:
             raise refusals[0]
-        images = [sensorsim_pb2.RGBRenderReturn(image_bytes=made.data) for made in found]
-        return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=images)
+        return sensorsim_pb2.AggregatedRenderReturn(
+            rgb_returns=[sensorsim_pb2.RGBRenderReturn(image_bytes=one.data) for one in found],
+            lidar_returns=[self._sweep(one, context) for one in message.lidar_requests],
+        )
 
     @answered
     def get_version(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
@@ -184,8 +193,8 @@ class SensorsimServicer:
         return common_pb2.Empty()
 
     @answered
-    def render_lidar(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        raise RequestError("UNIMPLEMENTED", "this server renders cameras, no LiDAR")
+    def render_lidar(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+        return self._sweep(message, context)
 
     @answered
     def get_external_asset_objects(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
@@ -200,6 +209,16 @@ class SensorsimServicer:
     @answered
     def restore_model_parameters(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
         raise RequestError("UNIMPLEMENTED", "this server changes no scene")
+
+    def _sweep(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401
+        """The points of one LiDAR, as a message."""
+
+        def measured() -> Any:  # noqa: ANN401
+            request = read_sweep(message)
+            return points_message(measured_points(self.scenes.get(request.scene_id), request))
+
+        key = message.SerializeToString(deterministic=True)
+        return self.queue.answer(key, measured, context.time_remaining())
 
     def _made(self, messages: Sequence[Any], context: "ServicerContext") -> list[_Made]:
         """The images of a message, drawn together; each is there or says why it is not."""

@@ -4,12 +4,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from catalog.artefacts import ArtefactRef
 from lidarpainter_models.devices import Device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.renderer import ServedScene
 from lidarpainter_models.serving.scene_pool import LoadedScene
 from tasks.evaluation.shown import condition_builder
+from tasks.lidar.channel import load_channel
 from tasks.opened import opened
 from tasks.stored import load_scene
 from tasks.views.render import ViewedRun
@@ -25,9 +27,10 @@ def load_served(
     device: Device,
     is_painted: bool,
     is_measured: bool,
+    lidar: ArtefactRef | None,
     name: str,
 ) -> LoadedScene:
-    """Load what a run's images are made from.
+    """Load what a run's images are made from, and its sweeps where a LiDAR channel is given.
 
     Raises:
         ConfigError: a scene in a style is to be painted, or the device is not there.
@@ -53,7 +56,9 @@ def load_served(
         envelope=envelope,
         is_measured=is_measured,
         streams=streams,
+        returns=None if lidar is None else load_channel(this.store, lidar),
     )
-    files = [this.store.artefacts.files(ref) for ref in (fitted.gaussians, fitted.observations)]
+    parts = (fitted.gaussians, fitted.observations, *(() if lidar is None else (lidar,)))
+    files = [this.store.artefacts.files(ref) for ref in parts]
     num_bytes = sum(path.stat().st_size for folder in files for path in folder.iterdir())
     return LoadedScene(served, GROWTH * num_bytes)

@@ -132,13 +132,13 @@ def test_a_bad_item_of_a_batch_leaves_the_others(street, channel, view):
         assert dict(told.trailing_metadata())[KEYS[0]].split(",")[1] == ""
 
 
-def test_an_aggregated_request_is_drawn_and_lidar_is_not(street, client, view):
+def test_an_aggregated_request_is_drawn_and_a_refused_part_refuses_it(street, client, view):
     asked = pb.AggregatedRenderRequest(rgb_requests=[street.request(view)])
     reply = client.render_aggregated(asked, timeout=60)
     alone = client.render_rgb(street.request(view), timeout=60)
     assert reply.rgb_returns[0].image_bytes == alone.image_bytes
     asked.lidar_requests.add(**SCENE)
-    assert code_of(client.render_aggregated, asked)[0] == "UNIMPLEMENTED"
+    assert code_of(client.render_aggregated, asked)[0] == "INVALID_ARGUMENT"
 
 
 def test_every_refusal_has_its_code(street, client, view):
@@ -247,7 +247,6 @@ def test_only_a_server_that_may_be_ended_is(street):
 def test_what_is_not_there_says_so_in_one_line(client):
     calls = wire.calls()
     names = [
-        "render_lidar",
         "edit_assets",
         "restore_model_parameters",
         "get_external_asset_objects",

@@ -9,6 +9,9 @@ import lidarpainter_models as lp
 from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
+from lidarpainter_models.gaussians.returns.fitting import fit_lidar
+from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.lidar.firings import mounted_lidar
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.serving import wire
 from lidarpainter_models.serving.messages import camera_message, pose_message
@@ -19,6 +22,8 @@ from lidarpainter_models.serving.scene_pool import LoadedScene, ScenePool
 from lidarpainter_models.serving.server import grpc_server
 from lidarpainter_models.serving.servicer import SensorsimServicer
 from lidarpainter_models.synthetic import SyntheticStreet, write_street
+
+QUICK = LidarConfig(num_surfels=20_000, steps=20, rays_per_step=4096, rays_per_sweep=10_000)
 
 
 class ServedStreet:
@@ -47,6 +52,13 @@ class ServedStreet:
             observation=self.size,
             calibration=calibration_of(None),
         )
+
+    @cached_property
+    def returns(self):
+        """What a quick look at the training sweeps says of the LiDAR."""
+        frames = self.recording.frame_indices[::2]
+        lidar = mounted_lidar(self.recording, self.recording.lidar_names[0], frames)
+        return fit_lidar(self.recording, self.scene, lidar, frames, QUICK)
 
     def request(self, view, *, actors=None, pose=None, camera=None, **fields):
         """An `RGBRenderRequest` of a recorded view, its actors where they were."""
