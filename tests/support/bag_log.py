@@ -29,17 +29,19 @@ POINT_BYTES = 24
 class BagScene:
     """What a bag is made of: poses of the car, sensors on it, points as they were measured."""
 
-    def __init__(self, scene):
-        self.scene = scene
+    def __init__(self, scene, *, are_cameras_free=False):
+        """Cameras are mounted on the car, or free: each image has a transform of its own."""
+        self.scene, self.are_cameras_free = scene, are_cameras_free
         self.times_ns = scene.frame_timestamps_ns.numpy()
-        views = {view.camera_name: view for view in reversed(scene.views)}
-        self.cameras = {name: scene.image_record(view).camera for name, view in views.items()}
-        self.lenses = {name: scene.image_record(view).distortion for name, view in views.items()}
+        self.images = [(scene.image_record(view), view) for view in scene.views]
+        records = {record.camera_name: record for record, _ in reversed(self.images)}
+        self.cameras = {name: record.camera for name, record in records.items()}
+        self.lenses = {name: record.distortion for name, record in records.items()}
         self.car_from_camera = {
-            name: invert_rigid(self.car_at([view.timestamp_ns])[0])
+            name: invert_rigid(self.car_at([record.timestamp_ns])[0])
             @ self.global_from_world
-            @ view.camera.world_from_camera
-            for name, view in views.items()
+            @ record.camera.world_from_camera
+            for name, record in records.items()
         }
         sweeps = {sweep.lidar_name: sweep for sweep in reversed(scene.sweeps)}
         self.car_from_lidar = {
@@ -49,7 +51,7 @@ class BagScene:
             for name, sweep in sweeps.items()
         }
         steps_ns = np.arange(self.times_ns[0] - 10**8, self.times_ns[-1] + 10**8, 10**7)
-        stated_ns = [view.timestamp_ns for view in scene.views] + self.times_ns.tolist()
+        stated_ns = [record.timestamp_ns for record, _ in self.images] + self.times_ns.tolist()
         self.poses_ns = np.unique(np.concatenate([steps_ns, stated_ns]))
 
     @property
@@ -64,10 +66,14 @@ class BagScene:
         """Moving ones: time, parent, child, pose."""
         for time_ns, pose in zip(self.poses_ns.tolist(), self.car_at(self.poses_ns), strict=True):
             yield time_ns, WORLD, CAR, pose
+        for record, _ in self.images if self.are_cameras_free else ():
+            pose = self.global_from_world @ record.camera.world_from_camera
+            yield record.timestamp_ns, WORLD, record.camera_name, pose
 
     def mounts(self):
         """Static ones: parent, child, pose."""
-        for name, pose in {**self.car_from_camera, **self.car_from_lidar}.items():
+        cameras = {} if self.are_cameras_free else self.car_from_camera
+        for name, pose in {**cameras, **self.car_from_lidar}.items():
             yield CAR, name, pose
 
     def cloud(self, sweep):
@@ -105,7 +111,7 @@ class BagScene:
         found = [(int(self.poses_ns[0]), "mounts", None)]
         found += [(int(self.poses_ns[0]), "lens", name) for name in self.cameras]
         found += [(time[0], "transform", time) for time in self.transforms()]
-        found += [(view.timestamp_ns, "image", view) for view in self.scene.views]
+        found += [(record.timestamp_ns, "image", (record, view)) for record, view in self.images]
         found += [(sweep.timestamp_ns + 10**7, "sweep", sweep) for sweep in self.scene.sweeps]
         found += [
             (int(time_ns) + 10**7, "boxes", frame)
@@ -293,9 +299,9 @@ class RosWriter:
         return self.make("vision_msgs/Detection3DArray", header=header, detections=found)
 
 
-def write_ros_bag(scene, file, *, compression=CompressionType.ZSTD):
+def write_ros_bag(scene, file, *, compression=CompressionType.ZSTD, are_cameras_free=False):
     """Write a scene as ROS 2 would have recorded it."""
-    bag = BagScene(scene)
+    bag = BagScene(scene, are_cameras_free=are_cameras_free)
     with RosWriter(file, compression=compression) as writer:
         for log_ns, kind, content in bag.messages():
             for topic, message in _ros_messages(writer, bag, log_ns, kind, content):
@@ -312,8 +318,10 @@ def _ros_messages(writer, bag, log_ns, kind, content):
         lens = writer.lens(log_ns, content, bag.cameras[content], bag.lenses[content])
         yield f"cameras/{content}/camera_info", lens
     elif kind == "image":
-        jpeg, name = bag.scene.read_jpeg(content), content.camera_name
-        yield CAMERA.format(name), writer.image(content.timestamp_ns, name, jpeg)
+        record, view = content
+        jpeg = bag.scene.read_jpeg(view)
+        image = writer.image(record.timestamp_ns, record.camera_name, jpeg)
+        yield CAMERA.format(record.camera_name), image
     elif kind == "sweep":
         start_ns, columns = bag.cloud(content)
         cloud = writer.cloud(start_ns, content.lidar_name, packed(columns))
@@ -380,11 +388,11 @@ def _foxglove_messages(bag, log_ns, kind, content):
         )
     elif kind == "image":
         yield (
-            CAMERA.format(content.camera_name),
+            CAMERA.format(content[0].camera_name),
             fox.CompressedImage(
-                timestamp=_timestamp(content.timestamp_ns),
-                frame_id=content.camera_name,
-                data=bytes(bag.scene.read_jpeg(content)),
+                timestamp=_timestamp(content[0].timestamp_ns),
+                frame_id=content[0].camera_name,
+                data=bytes(bag.scene.read_jpeg(content[1])),
                 format="jpeg",
             ),
         )

@@ -166,13 +166,12 @@ def _num_bytes(topic: BagTopic) -> int:
 
 
 def _names(topics: Iterable[str], otherwise: str) -> dict[str, str]:
-    """A name for each topic, of the words that tell it from others."""
+    """A name for each topic, of those of its parts that tell it from others."""
     found: dict[str, str] = {}
     for topic in topics:
-        words = [
-            word for word in re.findall(r"[A-Za-z0-9]+", topic) if word.lower() not in _GENERAL
-        ]
-        base = name = "_".join(words)[:40] or otherwise
+        parts = [re.findall(r"[A-Za-z0-9]+", part) for part in topic.split("/")]
+        own = ["_".join(words) for words in parts if not _GENERAL.issuperset(map(str.lower, words))]
+        base = name = "_".join(own)[:40] or otherwise
         number = 2
         while name in found.values():
             name, number = f"{base}_{number}", number + 1

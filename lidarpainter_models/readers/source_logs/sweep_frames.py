@@ -67,12 +67,13 @@ def compensated(
     """
     if not len(times_ns):
         return torch.zeros(0, 3)
-    first_ns = int(times_ns.min())
-    count = (int(times_ns.max()) - first_ns) // _KNOT_NS + 2
-    knots_ns = first_ns + _KNOT_NS * np.arange(count, dtype=np.int64)
+    first_ns, last_ns = int(times_ns.min()), int(times_ns.max())
+    even_ns = np.arange(first_ns, last_ns + 2 * _KNOT_NS, _KNOT_NS, dtype=np.int64)
+    own_ns = poses_ns[(poses_ns > first_ns) & (poses_ns < last_ns)]  # where the motion has a corner
+    knots_ns = np.union1d(even_ns, own_ns)
     knots = poses_at(world_from_body, poses_ns, knots_ns).numpy()
-    knot, rest_ns = np.divmod(times_ns - first_ns, _KNOT_NS)
-    share = (rest_ns / _KNOT_NS)[:, None]
+    knot = np.searchsorted(knots_ns, times_ns, side="right") - 1
+    share = ((times_ns - knots_ns[knot]) / (knots_ns[knot + 1] - knots_ns[knot]))[:, None]
     mixed = (1 - share) * _moved(knots[knot], xyz_body_m) + share * _moved(
         knots[knot + 1], xyz_body_m
     )
