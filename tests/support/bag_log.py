@@ -9,6 +9,7 @@ detections in the world. ROS messages are encoded by rosbags, those of Foxglove 
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -108,7 +109,7 @@ class BagScene:
 
     def messages(self):
         """What is recorded, by time: (time, kind, content)."""
-        found = [(int(self.poses_ns[0]), "mounts", None)]
+        found: list[tuple[int, str, Any]] = [(int(self.poses_ns[0]), "mounts", None)]
         found += [(int(self.poses_ns[0]), "lens", name) for name in self.cameras]
         found += [(time[0], "transform", time) for time in self.transforms()]
         found += [(record.timestamp_ns, "image", (record, view)) for record, view in self.images]
@@ -398,8 +399,8 @@ def _foxglove_messages(bag, log_ns, kind, content):
         )
     elif kind == "sweep":
         start_ns, columns = bag.cloud(content)
-        numeric = fox.PackedElementFieldNumericType
-        of_ros = {7: numeric.Float32, 4: numeric.Uint16, 6: numeric.Uint32}
+        kinds = fox.PackedElementFieldNumericType
+        of_ros = {7: kinds.Float32, 4: kinds.Uint16, 6: kinds.Uint32}
         fields = [
             fox.PackedElementField(name=name, offset=at, type=of_ros[kind])
             for name, at, kind in (*POINT_FIELDS, ("x", 18, 7))

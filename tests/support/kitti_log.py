@@ -9,6 +9,7 @@ cameras that look the same way; its poses are in Mercator's plane afterwards.
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -147,8 +148,7 @@ class _Drive:
         for name, own in self.camera_names.items():
             frame_index = self.scene.frame_indices[position]
             view = next(v for v in self.scene.views_of(own) if v.frame_index == frame_index)
-            pixels = decode_image(bytes(self.scene.read_jpeg(view)))
-            assert pixels is not None
+            pixels: Any = decode_image(bytes(self.scene.read_jpeg(view)))
             _write(image(name), cv2.imencode(".png", pixels)[1].tobytes())
         _write(sweep, self.scan(position).tobytes())
 
