@@ -164,7 +164,7 @@ def refused(words, expected, place):
         ((*IN_SCENE, "--painter", "warp"), "--in-scene has no use for --painter"),
         ((*IN_SCENE, "--allow-collisions"), "--in-scene has no use for --allow-collisions"),
         (("evaluate", "latest"), "no complete run in {store}"),
-        (("evaluate", "latest", "--protocol", "guess"), "expected paper, truth, cross-camera"),
+        (("evaluate", "latest", "--protocol", "guess"), "expected paper, truth, neurad"),
         (("evaluate", "latest", "--previous", "mixed"), "is judged by --protocol flicker"),
         (
             ("evaluate", "latest", "--protocol", "flicker", "--all-views"),
