@@ -8,10 +8,17 @@ not hear each other.
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from lidarpainter_models.viewing.watching import Watch
+
+class Watch(Protocol):
+    """Shows running fits to somebody; see `lidarpainter_models.viewing.watching`."""
+
+    def is_due(self) -> bool:
+        """Whether what is shown is so old that it should be replaced."""
+
+    def show(self, scene: Any, views: Any) -> None:  # noqa: ANN401 - what a fit is no part of here
+        """Show a scene (`GaussianScene`), seen from the first of its training views."""
 
 
 class ProgressListener:
@@ -20,7 +27,7 @@ class ProgressListener:
     A stage is named by the word used in `seconds` of the results.
     """
 
-    watch: "Watch | None" = None
+    watch: Watch | None = None
     """What shows running fits, where somebody watches."""
 
     def started(self, stage: str) -> None:

@@ -21,7 +21,7 @@ from tiny_street import (
     reconstructed,
 )
 
-from flows.cli.evaluate import PROTOCOLS
+from flows.cli.evaluate import NEURAD, PROTOCOLS
 from lidarpainter_models.export.images import read_image
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
 from tasks.reconstruction.report import WORST_FILE
@@ -240,7 +240,7 @@ def test_a_shifted_camera_stands_where_it_was_asked_to(tiny_run, tmp_path):
     assert poses["recorded"][:3, 0] @ moved_m == pytest.approx(-2.0, abs=0.02)  # x is to the right
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", [name for name in PROTOCOLS if name != NEURAD])
 def test_evaluate_judges_by_every_protocol_and_only_once(tiny_run, protocol):
     words = ("evaluate", tiny_run.run_id, "--protocol", protocol)
     first, again = (succeed(*words, "--json", store=tiny_run.store) for _ in range(2))
@@ -254,6 +254,13 @@ def test_evaluate_judges_by_every_protocol_and_only_once(tiny_run, protocol):
     shown = succeed(*words, store=tiny_run.store)
     assert tiny_run.run_id in shown.out
     assert "was there" in shown.err
+
+
+def test_a_run_of_another_split_is_not_judged_as_neurad_studio_does(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--protocol", NEURAD)
+    assert "--split linspace, this one was with --split alternate" in refuse(
+        *words, store=tiny_run.store
+    )
 
 
 def test_paper_protocol_gives_the_figures_of_the_run(tiny_run):

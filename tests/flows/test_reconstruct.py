@@ -155,7 +155,8 @@ def test_a_file_says_what_options_do_and_options_count_more(tmp_path, store, mon
     path, asked = tmp_path / "run.toml", []
     path.write_text('preset = "brief"\npainter = "none"\nset = ["fit.steps=7", "rounds=1"]\n')
 
-    def known(parameters, _store):
+    def known(parameters, _store, *, is_watched):
+        assert not is_watched
         asked.append(parameters)
         return {"run_id": "abc"}
 

@@ -30,7 +30,7 @@ LONGEST_S = 2.0
 def server(tiny_run, tmp_path_factory):
     """The process of a server, where it listens, and its log."""
     log = tmp_path_factory.mktemp("serve") / "trust.csv"
-    words = ["--store", str(tiny_run.store.root), "serve", "latest", "--port", "0"]
+    words = ["--store", str(tiny_run.store.root), "serve", tiny_run.run_id, "--port", "0"]
     process = subprocess.Popen(
         [sys.executable, "-m", "flows.cli", *words, "--http-port", "0", "--log", str(log)],
         stdout=subprocess.PIPE,
@@ -48,7 +48,7 @@ def test_a_served_run_answers_as_render_and_ends_soon(tiny_run, server, tmp_path
     process, (address, http_address), log = server
     out = tmp_path / "images"
     where = ("--trajectory", "recorded", "--camera", FRONT, "--frames", "2:3", "--out", out)
-    succeed("render", "latest", *where, store=tiny_run.store)
+    succeed("render", tiny_run.run_id, *where, store=tiny_run.store)
     (image,) = json.loads((out / "trajectory.json").read_text("utf-8"))["images"]
     with grpc.insecure_channel(address) as channel:
         client = wire.client(channel)
@@ -76,7 +76,7 @@ def actors_of(tiny_run, image):
     from tasks.runs import open_run
     from tasks.stored import load_scene
 
-    scene = load_scene(tiny_run.store, open_run(tiny_run.store, "latest").final.gaussians)
+    scene = load_scene(tiny_run.store, open_run(tiny_run.store, tiny_run.run_id).final.gaussians)
     poses, present = scene.actors.refined_poses(image["timestamp_ns"])
     tracks = zip(scene.actors.recorded_tracks, poses, present, strict=True)
     return [(track.actor_id, pose) for track, pose, is_there in tracks if is_there]
@@ -112,12 +112,12 @@ def request_of(image, actors):
     ],
 )
 def test_what_cannot_be_served_is_one_line(tiny_run, words, expected):
-    assert expected in refuse("serve", "latest", *words, store=tiny_run.store)
+    assert expected in refuse("serve", tiny_run.run_id, *words, store=tiny_run.store)
 
 
 def test_a_missing_extra_is_one_line(tiny_run, monkeypatch):
     monkeypatch.setitem(sys.modules, "grpc", None)
-    line = refuse("serve", "latest", "--port", "0", store=tiny_run.store)
+    line = refuse("serve", tiny_run.run_id, "--port", "0", store=tiny_run.store)
     assert "lidarpainter[simulators]" in line
 
 
@@ -126,5 +126,5 @@ def test_a_port_that_is_taken_is_one_line(tiny_run):
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        line = refuse("serve", "latest", "--port", port, store=tiny_run.store)
+        line = refuse("serve", tiny_run.run_id, "--port", port, store=tiny_run.store)
     assert port in line

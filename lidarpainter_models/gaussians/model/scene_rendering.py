@@ -42,7 +42,12 @@ def gaussians_at(
     """
     if timestamp_ns is None:
         return blinking.lit_on_average(gaussians)
-    return actors.bending.bent(blinking.lit(gaussians, timestamp_ns), timestamp_ns)
+    return bent_at(blinking.lit(gaussians, timestamp_ns), actors, timestamp_ns)
+
+
+def bent_at(gaussians: AnyGaussians, actors: Actors, timestamp_ns: int) -> AnyGaussians:
+    """Gaussians as people hold their limbs at a time, in the colours that they have."""
+    return actors.bending.bent(gaussians, timestamp_ns)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

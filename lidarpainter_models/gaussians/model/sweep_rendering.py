@@ -16,6 +16,7 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.scene_rendering import bent_at
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.ray_gaussians import (
     BLENDED,
@@ -142,7 +143,7 @@ class _Street:
         if not len(self.of_actors):
             return replace(whole, means=means.float())
         rows, own = self.of_actors, solids.gaussians.select(self.of_actors)
-        bent = actors.bending.bent(own, piece.time_ns)
+        bent = bent_at(own, actors, piece.time_ns)
         pose, rate, is_there = _bodies(actors, piece.time_ns)
         body = own.body_index.long() - 1
         placed = torch.einsum("gij,gj->gi", pose[body, :3, :3], bent.means.double())

@@ -59,7 +59,7 @@ def edit(log, pattern, column, value):
         (MOUNTS, "tx_m", 1000.0, "the sensor is 1000"),
         (SWEEP, "laser_number", 64, "a laser 64, expected 0 to 63"),
         (SWEEP, "offset_ns", 10**12, "a point is 1e+03 s from its sweep"),
-        (SWEEP, "x", 5000.0, "a point is 499"),
+        (SWEEP, "x", 5000.0, " m from its LiDAR, expected 1000 m at most"),
         (SWEEP, "intensity", ["bright"], "intensity: is string, expected numbers"),
     ],
 )
