@@ -2,8 +2,9 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +12,9 @@ from flows.cli.output import clear_status
 from flows.cli.shared_options import check_painter, described, named_run, parse_bytes, parse_seconds
 from lidarpainter_models.devices import check_device
 from lidarpainter_models.errors import ConfigError
+
+if TYPE_CHECKING:
+    from catalog.store import Store
 
 WORDS = """
 runs: Runs to serve, each by its id or the beginning of it, a scene such as pandaset/002 (its newest
@@ -65,14 +69,11 @@ def serve(  # noqa: PLR0913 - the options of a command
     run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
     check_painter(painter)
     from catalog.store import existing_store
-    from flows.cli.progress import shown_progress
-    from flows.serve import ServeRequest, learn_lidars, serve_runs
+    from flows.serve import ServeRequest, serve_runs
 
     store = existing_store()
     if lidar:
-        with shown_progress():
-            learn_lidars(store, run_ids)
-
+        learn(store, run_ids)
     serve_runs(
         store,
         ServeRequest(
@@ -95,6 +96,15 @@ def serve(  # noqa: PLR0913 - the options of a command
         opened_at=opened_at,
         stopped=threading.Event(),
     )
+
+
+def learn(store: "Store", run_ids: Sequence[str]) -> None:
+    """Learn what the LiDAR of each run's log sees, and show how far that is."""
+    from flows.cli.progress import shown_progress
+    from flows.serve import learn_lidars
+
+    with shown_progress():
+        learn_lidars(store, run_ids)
 
 
 def opened_at(address: str, http_address: str | None) -> None:
