@@ -8,7 +8,7 @@ were, how many there were, and why a distance is absent.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -58,8 +58,7 @@ def neurad_scores(
             device=shown.scene.device,
             told=lambda: progress(next(renders), len(views)),
         )
-        figures = {} if scores is None else asdict(scores)
-        found[name] = {each: figures[each] for each in FIGURES}
+        found[name] = {each: getattr(scores, each) for each in FIGURES}
         found[name]["num_columns"] = own[0].camera.width_px
     return {NEURAD: {**found, "all": _over_all(list(found.values()))}}
 
