@@ -126,9 +126,8 @@ class SensorsimServicer:
     def render_aggregated(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
         if len(message.lidar_requests) > MOST_SWEEPS:
             raise invalid(f"{len(message.lidar_requests)} sweeps: expected at most {MOST_SWEEPS}")
-        asks_nothing = not message.lidar_requests and not message.rgb_requests
-        has_images = bool(message.rgb_requests) or asks_nothing
-        found = self._made(message.rgb_requests, context) if has_images else []
+        asks_for_sweeps_alone = message.lidar_requests and not message.rgb_requests
+        found = [] if asks_for_sweeps_alone else self._made(message.rgb_requests, context)
         refusals = [made.refusal for made in found if made.refusal is not None]
         if refusals:
             raise refusals[0]
