@@ -83,8 +83,28 @@ def reconstruct_flow(parameters: ReconstructParameters, store_path: Path) -> dic
     run_id, source_digest = run_identity(parameters, store), code_behind(START).digest
     with store.run_lock(run_id), working_on(scene=parameters.scene, run=run_id):
         record = begin_run(run, run_id, source_digest, parameters.preset, parameters)
+        course = Course(parameters=parameters, run=run, record=record)
         with early_end_recorded(store_path, record):
-            return _run(Course(parameters=parameters, run=run, record=record), store)
+            started = time.perf_counter()
+            seen = course.add("prepare", prepare(run, parameters.observation))
+            first = fit(run, "fit", seen.ref, parameters.fit, lpips=parameters.lpips)
+            fitted = final = FittedRef(seen.ref, course.add("fit", first).ref)
+            for number in range(1, parameters.rounds + 1):
+                final = _round(course, final, number)
+            if parameters.examines:
+                course.add(EXAMINE, examine(run))
+            scores = _judged(course, store, fitted, final) if parameters.judge else {}
+            result = _result(course, scores, final)
+            if parameters.report:
+                _report(course, store, result, fitted, final)
+            result["seconds"]["total"] = time.perf_counter() - started
+            refs = tuple(stage.ref for stage in course.stages.values())
+            # the catalog calls it what it is
+            named = {
+                fitted_on(parameters.painter) if name == "painted" else name: found
+                for name, found in scores.items()
+            }
+            return located(complete_run(store.address, record, result, named, refs), store)
 
 
 def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
@@ -124,30 +144,6 @@ def reconstruct_scene(
     """
     parameters = with_overrides(preset_named(preset, scene), settings)
     return reconstruct(parameters, open_store(store).address)
-
-
-def _run(course: Course, store: Store) -> dict[str, Any]:
-    started = time.perf_counter()
-    parameters, run = course.parameters, course.run
-    seen = course.add("prepare", prepare(run, parameters.observation))
-    first = fit(run, "fit", seen.ref, parameters.fit, lpips=parameters.lpips)
-    fitted = final = FittedRef(seen.ref, course.add("fit", first).ref)
-    for number in range(1, parameters.rounds + 1):
-        final = _round(course, final, number)
-    if parameters.examines:
-        course.add(EXAMINE, examine(run))
-    scores = _judged(course, store, fitted, final) if parameters.judge else {}
-    result = _result(course, scores, final)
-    if parameters.report:
-        _report(course, store, result, fitted, final)
-    result["seconds"]["total"] = time.perf_counter() - started
-    refs = tuple(stage.ref for stage in course.stages.values())
-    # the catalog calls it what it is
-    scores = {
-        fitted_on(parameters.painter) if name == "painted" else name: found
-        for name, found in scores.items()
-    }
-    return located(complete_run(store.address, course.record, result, scores, refs), store)
 
 
 def _round(course: Course, fitted: FittedRef, number: int) -> FittedRef:
