@@ -20,8 +20,9 @@ LONGEST_S = 300.0
 
 @pytest.mark.slow
 @needs_postgres
-def test_a_fleet_survives_thirty_kills():
-    found = run_chaos.run_chaos(sequences=100, corrupted=10, kills=30, seed=0, pace_s=2.0)
+def test_a_fleet_survives_its_kills():
+    """Thirty kills of a hundred sequences, for an hour: `python tests/chaos/run_chaos.py`."""
+    found = run_chaos.run_chaos(sequences=24, corrupted=3, kills=10, seed=0, pace_s=1.0)
     assert found["wrong"] == []
 
 
