@@ -51,6 +51,8 @@ class Asked(BaseModel):
     scene: str | None = None
     """What it is called in the store, if that could be read and may be another name than these."""
     root: Path | None = None
+    rig: Path | None = None
+    """The map of a bag, if one is given."""
     frames: tuple[int, int] | None = None
     seed: int | None = None
     width_px: int | None = None
@@ -213,10 +215,14 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
             dataset, _, name = scene.partition("/")
             yield Asked(sequence=name, **{**same, "dataset": dataset})
         return
-    named = source.root or ""
-    root = expanded(named) if named.startswith("~") else Path(named)
-    if not is_in_bucket(root):
-        root = (folder / root).resolve()
+    yield from _logs(source, same, folder, table)
+
+
+def _logs(source: Source, same: dict[str, Any], folder: Path, table: str) -> Iterator[Asked]:
+    root = _from(folder, source.root or "")
+    same["rig"] = None if source.map is None else _from(folder, source.map)
+    if same["rig"] is not None and not same["rig"].is_file():
+        raise ConfigError(f"{table}: map: {same['rig']}: no such file, expected a rig.toml")
     for name in _matching(source, root, table):
         called: str | None = None
         with suppress(DataError):  # the worker that reads it says what is wrong
@@ -227,6 +233,12 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
         except UnknownRecordError as error:
             raise ConfigError(f"{table}: {root}: {error}") from None
         yield asked
+
+
+def _from(folder: Path, named: str) -> Path:
+    """Where a manifest in a folder means a file or a root to be."""
+    path = expanded(named) if named.startswith("~") else Path(named)
+    return path if is_in_bucket(path) else (folder / path).resolve()
 
 
 def _streets(source: Source, same: dict[str, Any], table: str) -> Iterator[Asked]:
@@ -269,10 +281,10 @@ def _with_shared_reading(asked: Sequence[Asked]) -> list[Asked]:
         by_scene.setdefault(one.scene_id, []).append(one)
     cameras: dict[str, tuple[str, ...] | None] = {}
     for scene_id, same in by_scene.items():
-        readings = {(one.root, one.sequence, one.frames, one.width_px) for one in same}
+        readings = {(one.root, one.rig, one.sequence, one.frames, one.width_px) for one in same}
         if len(readings) > 1:
             raise ConfigError(
-                f"{scene_id} is asked for with different roots, frames or widths; "
+                f"{scene_id} is asked for with different roots, maps, frames or widths; "
                 "a store holds one of them"
             )
         choices = [frozenset(one.cameras) if one.cameras else None for one in same]

@@ -23,8 +23,9 @@ from pydantic import (
 
 from lidarpainter_models.errors import ConfigError
 
-SYNTHETIC, STORED = "synthetic", "stored"
-"""In place of a dataset: streets to be drawn, and scenes that are in the store."""
+SYNTHETIC, STORED, BAG = "synthetic", "stored", "mcap"
+"""In place of a dataset: streets to be drawn, and scenes that are in the store; bags, which alone
+have a map."""
 MAX_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _GLOB = re.compile(r"[A-Za-z0-9*?\[\]!._-]{1,64}")
@@ -38,12 +39,13 @@ WORDS = {
     "valid dictionary or instance of Configuration": "table",
 }
 """What TOML calls things that Python calls otherwise."""
-_SPECIAL_KEYS = {"root", "seeds", "scenes", "sequences", "frames", "width_px"}
+_SPECIAL_KEYS = {"root", "seeds", "scenes", "sequences", "frames", "width_px", "map"}
 _KEYS: dict[str, tuple[str, set[str]]] = {
     SYNTHETIC: ("seeds", {"frames", "width_px"}),
     STORED: ("scenes", set()),
+    BAG: ("root", {"sequences", "frames", "map"}),
 }
-"""What a source that is no dataset needs, and what else it may have of these."""
+"""What a source that is unlike other datasets needs, and what else it may have of these."""
 Publication = Literal["scores", "examination", "report", "assets"]
 _MODEL = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -96,6 +98,9 @@ class Source(BaseModel):
     """A dataset, `synthetic`, or `stored`."""
     root: Root | None = None
     """Folder or address of the dataset, as downloaded; a relative one counts from the manifest."""
+    map: StrictStr | None = None
+    """Of bags: the rig.toml that says which topic is which sensor; as proposed where it is left
+    out; a relative one counts from the manifest."""
     sequences: Annotated[tuple[Glob, ...], Field(min_length=1)] | None = None
     """Names or globs; left out: all."""
     scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None

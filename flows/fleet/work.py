@@ -113,7 +113,9 @@ def _bring_in(asked: Asked, store: Store) -> None:
     if asked.seed is None:
         frames = None if asked.frames is None else slice(*asked.frames)
         root = asked.root or Path()
-        request = IngestRequest(store.address, asked.dataset, root, frames, asked.read_cameras)
+        request = IngestRequest(
+            store.address, asked.dataset, root, frames, asked.read_cameras, asked.rig
+        )
         ingest_or_recall(request, asked.sequence, again=False)
         return
     if has_street(store, asked.street):

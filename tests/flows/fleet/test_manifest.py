@@ -140,6 +140,18 @@ def test_globs_take_what_lies_there(asked_of, tmp_path):
         asked_of(text.replace("logs", "absent"))
 
 
+def test_bags_may_have_a_map_and_nothing_else_may(asked_of, tmp_path):
+    text = 'name = "bags"\n[[source]]\ndataset = "mcap"\nroot = "night.mcap"\nmap = "rig.toml"\n'
+    (tmp_path / "night.mcap").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"\[\[source\]\] 1: map: .*rig.toml: no such file"):
+        asked_of(text)
+    (tmp_path / "rig.toml").write_text("")
+    (asked,) = asked_of(text)
+    assert (asked.scene_id, asked.rig) == ("mcap/night", tmp_path / "rig.toml")
+    with pytest.raises(ConfigError, match="map is not for dataset 'pandaset'"):
+        asked_of(f'name = "night"\n{LOGS}map = "rig.toml"\n')
+
+
 def test_one_scene_with_several_choices_of_cameras_is_read_once_with_all(asked_of):
     one = 'cameras = ["front_camera"]\n'
     both = 'cameras = ["front_left_camera", "front_camera"]\n'
@@ -148,7 +160,7 @@ def test_one_scene_with_several_choices_of_cameras_is_read_once_with_all(asked_o
     assert found[0].parameters.train_cameras == ("front_camera",)
     with pytest.raises(ConfigError, match="asked for twice with the same cameras"):
         asked_of(GOOD + STREETS)
-    with pytest.raises(ConfigError, match="with different roots, frames or widths"):
+    with pytest.raises(ConfigError, match="with different roots, maps, frames or widths"):
         asked_of(f"{GOOD}{one}{STREETS}{both}width_px = 64\n")
     with pytest.raises(ConfigError, match="no camera rear on the street"):
         asked_of(f'{GOOD}cameras = ["rear"]\n')
