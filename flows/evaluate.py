@@ -11,6 +11,7 @@ from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import (
     FLICKER,
+    MARKINGS,
     NEURAD,
     Scores,
     fitted_on,
@@ -20,6 +21,7 @@ from tasks.evaluation.views import (
     evaluate,
     evaluate_by_neurad,
     evaluate_flicker,
+    evaluate_markings,
     evaluate_strips,
     load_scores,
 )
@@ -39,7 +41,7 @@ class EvaluationRequest:
     run: str
     """A run id, a unique prefix of one, or `latest`."""
     protocol: str
-    """`paper`, `truth`, `neurad`, `cross-camera` or `flicker`."""
+    """`paper`, `truth`, `neurad`, `cross-camera`, `markings` or `flicker`."""
     is_painted: bool = False
     """Judge what is painted at view time as well."""
     painter: str | None = None
@@ -98,7 +100,11 @@ def _variants(
         judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged[VIEW_TIME] = finished.final
-    judges = {CROSS_CAMERA: evaluate_strips, NEURAD: evaluate_by_neurad}
+    judges = {
+        CROSS_CAMERA: evaluate_strips,
+        NEURAD: evaluate_by_neurad,
+        MARKINGS: evaluate_markings,
+    }
     judge = judges.get(request.protocol, evaluate)
     run = parameters.run_spec(store.address, painter=request.painter)
     scores = {}

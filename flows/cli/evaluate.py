@@ -22,8 +22,8 @@ STRIP_FIGURES = {
     "uncalibrated_psnr": "seen by both, as delivered",
     "whole_image_psnr": "all, as delivered",
 }
-NEURAD = "neurad"
-PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, FLICKER, LIDAR)
+NEURAD, MARKINGS = "neurad", "markings"
+PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, MARKINGS, FLICKER, LIDAR)
 WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
@@ -32,7 +32,8 @@ WORDS = """
 protocol: How the run is scored: paper (held-out views, and views beside the path where they are
   known), truth (views beside the path of a synthetic street, against exact images), neurad (every
   held-out image at its recorded pose, for runs with --split linspace: the protocol of
-  neurad-studio), cross-camera (cameras that no fit saw), flicker (neighbouring frames against each
+  neurad-studio), cross-camera (cameras that no fit saw), markings (painted lines, where LiDAR
+  points tell them), flicker (neighbouring frames against each
   other), or lidar (simulated sweeps against those of held-out frames).
 postpaint: Also score what is painted at view time.
 painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the run's own
@@ -124,7 +125,7 @@ def _check(
         raise ConfigError(f"--protocol {protocol!r}: expected {', '.join(PROTOCOLS)}")
     if previous is not None and protocol != FLICKER:
         raise ConfigError(f"--previous is judged by --protocol {FLICKER}, not by {protocol}")
-    if protocol in (CROSS_CAMERA, FLICKER, LIDAR):
+    if protocol in (CROSS_CAMERA, MARKINGS, FLICKER, LIDAR):
         given = {name: path is not None for name, path in zip(WEIGHTS, weights, strict=True)}
         refuse_unused(f"--protocol {protocol}", {"--all-views": all_views, **given})
 

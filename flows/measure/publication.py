@@ -39,14 +39,14 @@ from flows.measure.tables import (
     with_tables,
 )
 from lidarpainter_models.errors import ConfigError, LidarPainterError, SceneError
-from lidarpainter_models.evaluation.score_tables import FLICKER, NEURAD
+from lidarpainter_models.evaluation.score_tables import FLICKER, MARKINGS, NEURAD
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.machine import machine
 from tasks.opened import open_scene
 
 PAPER = "paper"
 """The protocol of what is under no other."""
-ON_REQUEST = {CROSS_CAMERA, FLICKER, NEURAD}
+ON_REQUEST = {CROSS_CAMERA, FLICKER, MARKINGS, NEURAD}
 """Protocols that no run is judged by as it ends."""
 VIEW_TIME = "view-time"
 DIGITS = 8

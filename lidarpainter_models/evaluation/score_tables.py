@@ -10,6 +10,8 @@ NEURAD = "neurad"
 """Entry of an evaluation by the protocol of neurad-studio, by camera."""
 LIDAR = "lidar"
 """Entry of an evaluation that judged simulated sweeps."""
+MARKINGS = "markings"
+"""Entry of an evaluation of painted lines, by trajectory."""
 FEW_RAYS = "too few rays, or the log does not tell which were lost"
 ENVELOPE = "envelope"
 """Entry of the scores of a run: how far beside the path the scene can be trusted."""
@@ -32,8 +34,8 @@ def metric_values(
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
     Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
-    have shifted paths alone, those by the protocol of neurad-studio cameras, and those of sweeps
-    figures by whose protocol they are.
+    have shifted paths alone, those by the protocol of neurad-studio cameras, those of
+    markings trajectories, and those of sweeps figures by whose protocol they are.
     """
     if "recorded" not in scores:
         return _by_part(scores)
@@ -54,7 +56,9 @@ def _by_part(
     scores: Mapping[str, Any],
 ) -> list[tuple[str, str, str, float | None, str | None]]:
     """Numbers of what was not judged as held-out views are, by camera, path or protocol."""
-    name_of = next((name for name in (NEURAD, LIDAR, FLICKER) if name in scores), "cross-camera")
+    name_of = next(
+        (name for name in (NEURAD, LIDAR, FLICKER, MARKINGS) if name in scores), "cross-camera"
+    )
     parts = dict(scores.get(name_of, scores))
     if name_of == LIDAR:
         parts = {name: parts[name] for name in ("neurad-studio", "own")}

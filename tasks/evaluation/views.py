@@ -4,10 +4,11 @@ Held-out views and views beside the path, cameras left out where they overlap on
 and neighbouring frames of shifted paths, which should not flicker.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
@@ -15,12 +16,14 @@ from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.flicker import FlickerEvaluation
 from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.markings import markings_scores
 from lidarpainter_models.evaluation.neurad_protocol import SPLIT, neurad_scores
 from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation
-from lidarpainter_models.evaluation.score_tables import FLICKER, NEURAD, Scores
+from lidarpainter_models.evaluation.score_tables import FLICKER, MARKINGS, NEURAD, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.evaluation.strips import StripEvaluation
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics.perceptual import load_distances
 from tasks.evaluation.shown import painted_by, shown_by
 from tasks.json_files import read_json, write_json
@@ -43,21 +46,11 @@ def evaluate(
     view_time: bool = False,
 ) -> StageResult:
     """Score a scene as it is, or what it shows once the run's painter has painted it."""
-    this = opened(run)
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind="evaluation",
-        inputs=evaluation_inputs(this, fitted, view_time=view_time)
-        | file_digests(config.weight_files),
-        config=_settings(run, config) | {"scoring": asdict(config.scoring)},
-        build=partial(
-            _build,
-            evaluation=SceneEvaluation(held_out=this.held_out(config.observation), config=config),
-            shown=shown_by(this, fitted, config, view_time=view_time),
-        ),
-    )
+    held_out = opened(run).held_out(config.observation)
+    build = partial(_build, evaluation=SceneEvaluation(held_out=held_out, config=config))
+    more = {"scoring": asdict(config.scoring)}
+    asked = _Asked(run, stage, fitted, config, view_time)
+    return _judged(asked, build, more=more, weights=config.weight_files)
 
 
 @stage_task
@@ -79,22 +72,26 @@ def evaluate_by_neurad(
             f"--protocol {NEURAD} judges runs that were fitted with --split {SPLIT}, this one was "
             f"with --split {run.split.spec}"
         )
-    this = opened(run)
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind="evaluation",
-        inputs=evaluation_inputs(this, fitted, view_time=view_time)
-        | file_digests(config.weight_files),
-        config=_settings(run, config),
-        build=partial(
-            _build_neurad,
-            held_out=this.held_out(config.observation),
-            config=config,
-            shown=shown_by(this, fitted, config, view_time=view_time),
-        ),
-    )
+    held_out = opened(run).held_out(config.observation)
+    build = partial(_build_neurad, held_out=held_out, config=config)
+    asked = _Asked(run, stage, fitted, config, view_time)
+    return _judged(asked, build, weights=config.weight_files)
+
+
+@stage_task
+def evaluate_markings(
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    *,
+    view_time: bool = False,
+) -> StageResult:
+    """Score the painted lines that a scene shows on its path and beside it."""
+    held_out, shifts = opened(run).held_out(config.observation), config.scoring.shifts
+    build = partial(_build_markings, held_out=held_out, shifts=shifts)
+    more = {"shifts": [asdict(shift) for shift in shifts]}
+    return _judged(_Asked(run, stage, fitted, config, view_time), build, more=more)
 
 
 @stage_task
@@ -117,19 +114,8 @@ def evaluate_strips(
         raise ConfigError(
             f"the fit saw every camera of {run.split.scene_id}; leave one out with --train-cameras"
         )
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind="strips",
-        inputs=evaluation_inputs(this, fitted, view_time=view_time),
-        config=_settings(run, config),
-        build=partial(
-            _build_strips,
-            evaluation=evaluation,
-            shown=shown_by(this, fitted, config, view_time=view_time),
-        ),
-    )
+    build = partial(_build_strips, evaluation=evaluation)
+    return _judged(_Asked(run, stage, fitted, config, view_time), build, kind="strips")
 
 
 @stage_task
@@ -167,6 +153,41 @@ def evaluate_flicker(
             ),
             painting=painted_by(this, fitted, config.conditions),
         ),
+    )
+
+
+class _Asked(NamedTuple):
+    """What is judged: a fitted scene of a run, as it is or painted at view time."""
+
+    run: RunSpec
+    stage: str
+    fitted: FittedRef
+    config: EvaluationConfig
+    view_time: bool
+
+
+def _judged(
+    asked: _Asked,
+    build: Callable[..., dict[str, Any]],
+    *,
+    kind: str = "evaluation",
+    more: Mapping[str, Any] | None = None,
+    weights: Mapping[str, Path] | None = None,
+) -> StageResult:
+    """Judge what a scene shows, which `build` is given as `shown`.
+
+    `more` are settings beside those of every evaluation, `weights` files that distances read.
+    """
+    run, stage, fitted, config, view_time = asked
+    this = opened(run)
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind=kind,
+        inputs=evaluation_inputs(this, fitted, view_time=view_time) | file_digests(weights or {}),
+        config=_settings(run, config) | dict(more or {}),
+        build=partial(build, shown=shown_by(this, fitted, config, view_time=view_time)),
     )
 
 
@@ -218,6 +239,19 @@ def _build_neurad(
     scores = neurad_scores(held_out, scene, distances, progress)
     write_json(place.output / SCORES_FILE, scores)
     return {name: scores[NEURAD]["all"][name] for name in ("psnr", "num_views")}
+
+
+def _build_markings(
+    place: Workplace,
+    progress: Progress,
+    *,
+    held_out: HeldOut,
+    shifts: tuple[Shift, ...],
+    shown: Callable[[], ShownScene],
+) -> dict[str, Any]:
+    scores = markings_scores(held_out, shown(), shifts, progress)
+    write_json(place.output / SCORES_FILE, scores)
+    return {name: found["auc"] for name, found in scores[MARKINGS].items()}
 
 
 def _build_strips(
