@@ -5,8 +5,10 @@ labelled, a rendered pixel on a point of a marking should be brighter than the r
 figure is the area under the ROC curve of that brightness between points of markings and points of
 road within `BESIDE_M` of one: 1 where every point of paint is brighter than any of road, 0.5 where
 the lines are gone. Points have no place in training images, so a line that lies across the road
-instead of along it costs as much as one that is missing. Where no point is labelled, ground that
-returns more light than what lies around it stands in for paint, and is named so. A synthetic street
+instead of along it costs as much as one that is missing. Labels are wider than paint and stand on
+worn paint as well: `confirmed_auc` takes those points alone that return clearly more light than the
+road. Where no point is labelled, ground that returns more light than what lies around it stands in
+for paint, and is named so. A synthetic street
 knows its paint exactly: there the pixels of lines are compared with their true colours as well.
 """
 
@@ -46,6 +48,8 @@ ROAD_NAMES = ("road", "driveable_surface", "flat.driveable_surface")
 """Names of point classes of the road around it."""
 NEIGHBOURS = 48
 """Points of the road around a point are looked at up to so many, the nearest within `BESIDE_M`."""
+CONFIRMED = 2.0
+"""Times the median intensity of the road around markings, from which on a return confirms paint."""
 GROUND_M = 0.15
 """Above the ground, what is still ground, where no point is labelled."""
 LEAST_BRIGHTER = 4.0
@@ -66,6 +70,8 @@ class RoadPoints:
 
     xyz_m: Float[Tensor, "points 3"]
     is_paint: Bool[Tensor, " points"]
+    is_confirmed: Bool[Tensor, " points"]
+    """Paint that returns `CONFIRMED` times the light of the road, or more."""
     all_m: Float[Tensor, "all 3"]
     """Every point of the sweep: what may stand before the road."""
 
@@ -75,6 +81,7 @@ class _Judged:
     """Brightness over the road around, of points that a view shows."""
 
     paint: Float[np.ndarray, " paint"]
+    confirmed: Float[np.ndarray, " confirmed"]
     road: Float[np.ndarray, " road"]
 
 
@@ -93,10 +100,11 @@ def markings_scores(
         progress: Is told how many renders of how many are done.
 
     Returns:
-        Under `markings`, by trajectory (`image`, `recorded`, then the shifts): `auc` (with
-        `auc_reason` where it is None), `num_paint` and `num_road`, and `told_by`: `labels` or
-        `intensity`. On a synthetic street also `paint_psnr` in dB and `paint_edge_error` in [0, 1],
-        over the pixels of lines and those beside them.
+        Under `markings`, by trajectory (`image`, `recorded`, then the shifts): `auc` over all
+        points of markings and `confirmed_auc` over those whose returns confirm them (with a
+        `_reason` where one is None), numbers of points, and `told_by`: `labels` or `intensity`.
+        On a synthetic street also `paint_psnr` in dB and `paint_edge_error` in [0, 1], over the
+        pixels of lines and those beside them.
 
     Raises:
         ConfigError: no held-out view of a frame with a sweep looks ahead.
@@ -137,6 +145,7 @@ def road_points(scene: DrivingScene, frame_index: int) -> RoadPoints:
     """The paint, and the road around it, that the sweeps of a frame have met."""
     sweeps = scene.sweeps_of(frame_index)
     xyz_m = torch.cat([scene.read_column(sweep, "xyz_m") for sweep in sweeps])
+    intensity = torch.cat([scene.read_column(sweep, "intensity").float() for sweep in sweeps])
     semantics, paint = scene.read_semantics(frame_index), _paint_classes(scene)
     if semantics is not None and paint:
         named = scene.semantic_classes.items()
@@ -144,14 +153,21 @@ def road_points(scene: DrivingScene, frame_index: int) -> RoadPoints:
         is_paint = torch.isin(semantics.long(), torch.tensor(paint))
         is_road = torch.isin(semantics.long(), torch.tensor(road))
     else:
-        intensity = torch.cat([scene.read_column(sweep, "intensity").float() for sweep in sweeps])
         is_paint, is_road = _by_intensity(xyz_m, intensity)
-    paint_m, road_m = xyz_m[is_paint], xyz_m[is_road]
-    if len(paint_m) and len(road_m):
-        reach, _ = cKDTree(paint_m.numpy()).query(road_m.numpy(), distance_upper_bound=BESIDE_M)
-        road_m = road_m[torch.from_numpy(np.isfinite(reach))]
-    both = torch.cat([paint_m, road_m])
-    return RoadPoints(xyz_m=both, is_paint=torch.arange(len(both)) < len(paint_m), all_m=xyz_m)
+    rows, beside = is_paint.nonzero()[:, 0], is_road.nonzero()[:, 0]
+    if len(rows) and len(beside):
+        tree = cKDTree(xyz_m[rows].numpy())
+        reach_m, _ = tree.query(xyz_m[beside].numpy(), distance_upper_bound=BESIDE_M)
+        beside = beside[torch.from_numpy(np.isfinite(reach_m))]
+    both = torch.cat([rows, beside])
+    of_paint = torch.arange(len(both)) < len(rows)
+    usual = intensity[beside].median() if len(beside) else torch.inf
+    return RoadPoints(
+        xyz_m=xyz_m[both],
+        is_paint=of_paint,
+        is_confirmed=of_paint & (intensity[both] >= CONFIRMED * usual),
+        all_m=xyz_m,
+    )
 
 
 def area_under_curve(
@@ -213,12 +229,17 @@ def _brightness(
     seen = _in_sight(camera, road)
     is_paint, xyz_m = road.is_paint[seen].numpy(), road.xyz_m[seen].numpy()
     if not is_paint.any() or is_paint.all():
-        return _Judged(paint=np.zeros(0), road=np.zeros(0))
+        return _Judged(paint=np.zeros(0), confirmed=np.zeros(0), road=np.zeros(0))
     uv = camera.project(road.xyz_m[seen].float())[0].long()
     light = (image[uv[:, 1], uv[:, 0]] @ _LUMA).numpy()
     over = light - _median_around(xyz_m[~is_paint], light[~is_paint], xyz_m)
     is_known = np.isfinite(over)
-    return _Judged(paint=over[is_paint & is_known], road=over[~is_paint & is_known])
+    is_confirmed = road.is_confirmed[seen].numpy()
+    return _Judged(
+        paint=over[is_paint & is_known],
+        confirmed=over[is_confirmed & is_known],
+        road=over[~is_paint & is_known],
+    )
 
 
 def _in_sight(camera: Camera, road: RoadPoints) -> Bool[Tensor, " points"]:
@@ -262,12 +283,16 @@ def _slope(image: Float[Tensor, "height width 3"]) -> Float[Tensor, "height widt
 
 
 def _of_points(judged: list[_Judged]) -> dict[str, Any]:
-    paint = np.concatenate([one.paint for one in judged])
     road = np.concatenate([one.road for one in judged])
-    is_enough = len(paint) >= LEAST_POINTS and len(road) > 0
-    found: dict[str, Any] = {"auc": area_under_curve(paint, road) if is_enough else None}
-    reason = {} if is_enough else {"auc_reason": FEW_POINTS}
-    return {**found, **reason, "num_paint": len(paint), "num_road": len(road)}
+    found: dict[str, Any] = {"num_road": len(road)}
+    parts = {"auc": [one.paint for one in judged], "confirmed_auc": [i.confirmed for i in judged]}
+    for name, values in parts.items():
+        paint = np.concatenate(values)
+        is_enough = len(paint) >= LEAST_POINTS and len(road) > 0
+        found[name] = area_under_curve(paint, road) if is_enough else None
+        found |= {} if is_enough else {f"{name}_reason": FEW_POINTS}
+        found[f"num_of_{name}"] = len(paint)
+    return found
 
 
 def _of_pixels(exact: list[tuple[float, float, int]]) -> dict[str, float]:

@@ -62,6 +62,7 @@ def test_true_images_show_the_lines_and_grey_ones_do_not(street, scene):
     grey = judged(scene, lambda camera, _: torch.full((camera.height_px, camera.width_px, 3), 0.4))
     for name in ("recorded", LEFT.name):
         assert true[name]["auc"] > 0.8
+        assert true[name]["confirmed_auc"] > 0.8
         assert grey[name]["auc"] == 0.5
         assert true[name]["paint_psnr"] > grey[name]["paint_psnr"] + 20
         assert true[name]["paint_edge_error"] == pytest.approx(0.0, abs=1e-6)
