@@ -188,10 +188,7 @@ class Explainer:
             yield f"code changed: {', '.join(changed)}"
 
     def _newest(self, ref: ArtefactRef, manifest: Manifest) -> dict[str, Any] | None:
-        """The newest artefact of the same kind and parts that shares an input with this one.
-
-        What a run made beside this one, such as the paintings of its next round, is another thing.
-        """
+        """The newest artefact of the same kind and parts that shares an input with this one."""
         beside = self._made_beside(ref.artefact_id)
         rows = [
             row

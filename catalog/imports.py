@@ -21,12 +21,7 @@ from typing import IO, Any
 
 import pyarrow as pa
 
-from catalog.archives import (
-    ARCHIVE_MANIFEST,
-    ARCHIVE_VERSION,
-    MAX_MANIFEST_BYTES,
-    TABLES_IN_ORDER,
-)
+from catalog.archives import ARCHIVE_MANIFEST, ARCHIVE_VERSION, MAX_MANIFEST_BYTES, TABLES_IN_ORDER
 from catalog.artefacts import MANIFEST_NAME, ArtefactRef, ArtefactStore
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors

@@ -9,14 +9,7 @@ another one takes over begins anew. Whether an artefact is complete is asked of 
 from collections.abc import Collection
 from pathlib import Path
 
-from catalog.artefacts import (
-    MANIFEST_NAME,
-    ArtefactRef,
-    ArtefactStore,
-    Build,
-    Manifest,
-    Recipe,
-)
+from catalog.artefacts import MANIFEST_NAME, ArtefactRef, ArtefactStore, Build, Manifest, Recipe
 from catalog.errors import DamagedArtefactError
 from catalog.mirrors import Mirror
 

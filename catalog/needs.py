@@ -157,10 +157,7 @@ class Needs:
         return found | self._wanted_styles()
 
     def _wanted_styles(self) -> set[str]:
-        """The runs in styles that sequences ask for, of what their own runs have made.
-
-        A style is known by the scene it was given: who made that scene may be an older run.
-        """
+        """The runs in styles that sequences ask for, of what their own runs have made."""
         made = {row["run_id"]: row["artefacts"] or () for row in self.runs}
         wanted = {
             (name.partition("/")[2], variant)

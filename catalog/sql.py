@@ -9,7 +9,7 @@ Whatever is asked can read those files and nothing else: no other file, no netwo
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -18,6 +18,33 @@ from typing import Any
 from catalog.errors import CatalogError, StorageError
 from catalog.schemas import TABLES, ColumnType, TableSchema
 from catalog.tables import CatalogTables, Row
+
+HEAD = """# Tables of the catalog
+
+Delta Lake tables below `STORE/tables/`, each merged on its first column. Times are UTC, JSON is
+canonical (sorted keys, no spaces). This page is what `lidarpainter catalog tables` prints, from the
+dictionary in `catalog/schemas.py`, which says too what becomes of tables that older or newer
+software wrote.
+
+`lidarpainter catalog list TABLE --as-of VERSION|TIME` shows a table as it was. DuckDB, polars and
+Spark read the same files; from Python, `deltalake.DeltaTable("STORE/tables/runs").to_pandas()`.
+"""
+
+
+def tables_page() -> str:
+    """All tables, one section each, as Markdown."""
+    return "\n".join([HEAD, *(line for table in TABLES.values() for line in _section(table))])
+
+
+def _section(table: TableSchema) -> Iterator[str]:
+    yield f"## {table.name}\n"
+    yield f"{table.description}\n"
+    yield "| column | type | unit | meaning |"
+    yield "|---|---|---|---|"
+    for column in table.columns:
+        yield f"| `{column.name}` | {column.type} | {column.unit} | {column.description} |"
+    yield ""
+
 
 LONGEST_S = 60.0
 MOST_MEMORY = "1GB"
@@ -72,11 +99,7 @@ class CatalogSql:
         self._connection.execute("SET lock_configuration = true")
 
     def ask(
-        self,
-        sql: str,
-        parameters: Mapping[str, Any] | None = None,
-        *,
-        most_rows: int = MOST_ROWS,
+        self, sql: str, parameters: Mapping[str, Any] | None = None, *, most_rows: int = MOST_ROWS
     ) -> Answer:
         """Answer one SELECT.
 

@@ -13,18 +13,16 @@ from flows.train_painter import training_cost
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
-from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
 from lidarpainter_models.training_data.pairs import named_sets, open_sets
 from tasks.painter.evaluate import score_painters
 from tasks.painter.train import train, weights_path
 
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
 
-Tables = Mapping[str, Mapping[str, PainterTraining]]
+Tables = Mapping[str, Mapping[str, NanoTrainingConfig]]
 
 
 class AblationParameters(BaseModel):
@@ -34,16 +32,10 @@ class AblationParameters(BaseModel):
 
     train_folders: tuple[Path, ...]
     test_folders: tuple[Path, ...]
-    training: PainterTraining = NanoTrainingConfig()
+    training: NanoTrainingConfig = NanoTrainingConfig()
     """The recipe in which one thing is varied."""
     chosen: tuple[str, ...] | None = None
     """Names of the tables that are made; None makes all."""
-    tables: Tables | None = None
-    """Recipes by table and row; None takes those of the small painter (`nano.ablations`)."""
-    base: str | None = None
-    """Model that one-step painters are trained on."""
-    lpips: LpipsFiles = LpipsFiles()
-    """Weights for the loss of one-step painters."""
     feature_weights: Path | None = None
     device: Device = "auto"
 
@@ -57,13 +49,7 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
     painters = {name: name for name in UNLEARNED}
     costs = {}
     for label, config in recipes.items():
-        request = TrainingRequest(
-            sets=learnt,
-            config=config,
-            start=parameters.base,
-            lpips=parameters.lpips,
-            device=device,
-        )
+        request = TrainingRequest(sets=learnt, config=config, device=device)
         trained = train(store_path, f"train {label}", request)
         painters[label] = str(weights_path(open_store(store_path), trained.ref))
         costs[label] = training_cost(trained)
@@ -86,12 +72,9 @@ def check_ablation(parameters: AblationParameters) -> None:
     """Find what is missing before an hour of training.
 
     Raises:
-        ConfigError: no such table, a loss that lacks what it weighs, or pairs without the reference
-            image that a painter is shown.
+        ConfigError: no such table, or pairs without the reference image that a painter is shown.
         DataError: a folder holds no pairs.
-        WeightsError: the model cannot be used.
     """
-    job_for(parameters.training, parameters.base, parameters.lpips)
     _, recipes = _distinct(_tables(parameters))
     shown = [name for name, one in recipes.items() if REFERENCE in one.network.inputs]
     for folders in (parameters.train_folders, parameters.test_folders):
@@ -106,24 +89,20 @@ def check_ablation(parameters: AblationParameters) -> None:
 
 def _tables(parameters: AblationParameters) -> Tables:
     """The recipes of the chosen tables."""
-    tables = parameters.tables
     training = parameters.training
-    if tables is None and isinstance(training, NanoTrainingConfig):
-        tables = {
-            name: {row: replace(training, network=network) for row, network in networks.items()}
-            for name, networks in ablation_tables(training.network).items()
-        }
-    if tables is None:
-        raise ConfigError("an ablation of the one-step painter needs its tables of recipes")
+    tables = {
+        name: {row: replace(training, network=network) for row, network in networks.items()}
+        for name, networks in ablation_tables(training.network).items()
+    }
     for name in parameters.chosen or ():
         if name not in tables:
             raise ConfigError(f"no ablation {name!r}, expected {', '.join(tables)}")
     return {name: tables[name] for name in parameters.chosen or tables}
 
 
-def _distinct(tables: Tables) -> tuple[dict[str, dict[str, str]], dict[str, PainterTraining]]:
+def _distinct(tables: Tables) -> tuple[dict[str, dict[str, str]], dict[str, NanoTrainingConfig]]:
     """Every recipe once, under the label of its first row; and that label by table and row."""
-    recipes: dict[str, PainterTraining] = {}
+    recipes: dict[str, NanoTrainingConfig] = {}
     rows: dict[str, dict[str, str]] = {}
     for name, table in tables.items():
         rows[name] = {}

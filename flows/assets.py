@@ -3,9 +3,9 @@
 from typing import Any
 
 from catalog.store import Store
+from flows.derive import STYLE
 from flows.edit import EDIT
 from flows.parameters import view_parameters
-from flows.style_run import STYLE
 from lidarpainter_models.errors import ConfigError
 from tasks.assets.enter import enter_published
 from tasks.assets.publish import publish_assets

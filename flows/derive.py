@@ -25,6 +25,7 @@ A style, say, is one module-level function and one call:
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from catalog.artefacts import Workplace
@@ -32,13 +33,15 @@ from catalog.digests import canonical_json, digest_text, plain
 from catalog.records import RunRecord, run_id_of
 from catalog.store import Store
 from flows.parameters import view_parameters
-from flows.recall import located, recalled_run
-from flows.run_ends import early_end_recorded
+from flows.recall import early_end_recorded, located, recalled_run
+from lidarpainter_models.weather.mix import StyleMix
+from tasks.editing.edit import put_style
+from tasks.opened import open_scene
 from tasks.progress import Progress
 from tasks.reconstruction.publish import begin_run, complete_run
-from tasks.runs import FinishedRun
-from tasks.source import project_source
-from tasks.stages import run_stage
+from tasks.runs import FinishedRun, open_run
+from tasks.stages import project_source, run_stage
+from tasks.stored import load_observations, load_scene
 
 Build = Callable[[Workplace, Progress], Mapping[str, Any]]
 
@@ -160,3 +163,30 @@ def _derive(
         "report": None,
     }
     return located(complete_run.fn(store.address, record, result, {}, tuple(refs)), store)
+
+
+STYLE = "style"
+"""The kind of the change."""
+
+
+def style_run(store: Store, run: str, mix: StyleMix, *, seed: int) -> dict[str, Any]:
+    """Derive a run in a style, or recall the one that was; see `flows.derive`.
+
+    The seed decides which windows are lit and where puddles stand.
+    """
+    source = open_run(store, run)
+    recorded = open_scene(store, source.scene_id)
+    told = {"prompt": mix.text, "visibility_m": mix.visibility_m, "seed": seed}
+    return derive_run(
+        store,
+        source,
+        Change(kind=STYLE, parameters=told, inputs={"scene": recorded.content_digest}),
+        build=partial(
+            put_style,
+            scene=partial(load_scene, store, source.final.gaussians),
+            observations=partial(load_observations, store, source.final.observations),
+            recorded=partial(open_scene, store, source.scene_id),
+            mix=mix,
+            seed=seed,
+        ),
+    )

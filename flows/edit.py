@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from catalog.store import Store
-from flows.derive import Change, derive_run
+from flows.derive import STYLE, Change, derive_run
 from flows.parameters import view_parameters
-from flows.style_run import STYLE
 from flows.views import render_run
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.editing.edits import encounters, refuse_walls
@@ -130,10 +129,7 @@ def _distance_m(world_from_ego: Any, track: ActorTrack) -> float:  # noqa: ANN40
 
 
 def _origin(store: Store, run: FinishedRun) -> tuple[FinishedRun, Sequence[Operation]]:
-    """The run that edits begin from, and what was done to it already, styles too.
-
-    Where that run is gone, edits begin from the earliest one that is there.
-    """
+    """The run that edits begin from, and what was done to it already, styles too."""
     chain = lineage(store, run)
     done = list(takewhile(lambda one: _kind(one) in (EDIT, STYLE), chain))
     edits = [number for number, one in enumerate(done) if _kind(one) == EDIT]

@@ -71,11 +71,7 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
     if request.judges_all:
         scoring = replace(parameters.scoring, most_views=0)
         parameters = with_changes(parameters, {"scoring": scoring})
-    about = {
-        "run_id": finished.run_id,
-        "scene": finished.scene_id,
-        "protocol": request.protocol,
-    }
+    about = {"run_id": finished.run_id, "scene": finished.scene_id, "protocol": request.protocol}
     if request.protocol == FLICKER:
         return about | _flicker(store, finished, parameters, request)
     scores = _variants(store, finished, parameters, request)

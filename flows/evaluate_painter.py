@@ -11,10 +11,9 @@ from catalog.store import existing_store
 from flows.parameters import view_parameters
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.description import describe_painter
+from lidarpainter_models.painter.description import describe_painter, time_views
 from lidarpainter_models.painter.precision import faster_type, type_name
 from lidarpainter_models.painter.selection import PainterChoice
-from lidarpainter_models.painter.speed import time_views
 from lidarpainter_models.training_data.pairs import named_sets
 from tasks.painter.evaluate import score_painters
 from tasks.painter.held_out_fits import HeldOutFit

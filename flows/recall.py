@@ -4,18 +4,36 @@ Kept apart from `reconstruct`, so that a command that computes nothing imports n
 what a fit needs.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from catalog.artefacts import ArtefactRef
 from catalog.digests import plain
-from catalog.records import json_of, run_id_of
+from catalog.records import RunRecord, json_of, run_id_of
 from catalog.store import Store, open_store
+from flows.interruption import at_interruption
 from flows.parameters import ReconstructParameters
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import open_scene
-from tasks.source import code_behind
+from tasks.reconstruction.publish import end_run
+from tasks.stages import code_behind
 from tasks.weights import file_digests
+
+
+@contextmanager
+def early_end_recorded(store_path: Path, record: RunRecord) -> Iterator[None]:
+    """Enter into the catalog that a run failed or was interrupted, and let the error go on."""
+    interrupted = partial(end_run.fn, store_path, record, "interrupted", None)  # asks no server
+    with at_interruption(interrupted):
+        try:
+            yield
+        except Exception as error:
+            end_run(store_path, record, "failed", f"{type(error).__name__}: {error}")
+            raise
+
 
 START = "flows.reconstruct:reconstruct"
 """The code of a run is what this flow reaches."""

@@ -12,8 +12,7 @@ from catalog.store import Store, open_store
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
-from flows.recall import START, located, recalled, run_identity
-from flows.run_ends import early_end_recorded
+from flows.recall import START, early_end_recorded, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
@@ -32,16 +31,10 @@ from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
-from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import StageResult
+from tasks.stages import StageResult, code_behind
 
-UNJUDGED: Scores = {
-    "recorded": None,
-    "novel": None,
-    "recorded_by_camera": None,
-    ENVELOPE: None,
-}
+UNJUDGED: Scores = {"recorded": None, "novel": None, "recorded_by_camera": None, ENVELOPE: None}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,8 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from confidence_fit import EVIDENCE, NUM_BINS, calibrated, expected_calibration_error
+from confidence_trials import trials, true_psnr_db
 
 from catalog.store import Store, open_store
 from flows.overrides import with_overrides
@@ -40,17 +42,12 @@ from lidarpainter_models.evaluation.anchoring import (
     predicted_and_measured,
     what_frames_say,
 )
-from lidarpainter_models.evaluation.confidence_trials import trials, true_psnr_db
 from lidarpainter_models.evaluation.envelope import DIRECTIONS, MovedViews, trust_envelope
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.view_confidence import (
     BUNDLED,
-    EVIDENCE,
     GOOD_DB,
-    NUM_BINS,
     Calibration,
-    calibrated,
-    expected_calibration_error,
 )
 from lidarpainter_models.scenes.splits import evenly_taken
 from lidarpainter_models.synthetic import RigLidar, SyntheticStreetConfig

@@ -11,12 +11,12 @@ from dataclasses import replace
 from math import radians
 from pathlib import Path
 
+from fisheye_street import FisheyeStreet
 from weather_streets import FoggyStreet, RainyStreet
 
 from catalog.store import open_store
 from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigCamera, RigLidar
-from lidarpainter_models.synthetic.fisheye import FisheyeStreet
 from lidarpainter_models.synthetic.sequence import record_street
 from tasks.ingest.ingest import has_street, record_scene, writing
 from tasks.specs import street_id

@@ -8,6 +8,7 @@ see the thin task only, and what is done is written in the store.
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ParamSpec, TypeVar
 
 from prefect import Task
@@ -17,6 +18,7 @@ from prefect.context import FlowRunContext
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
+from catalog.code_closure import Code, SourceTree
 from catalog.digests import canonical_json, digest_text, plain
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
@@ -26,7 +28,22 @@ from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.kernels.backends import kernels_chosen
 from tasks.measuring import measured
 from tasks.progress import Progress, listener, progress_of
-from tasks.source import project_source
+
+PACKAGES = ("flows", "tasks", "lidarpainter_models")
+"""What can decide about a result; the catalog carries bytes and is not followed."""
+
+
+@cache
+def project_source() -> SourceTree:
+    """The source as it was when this process first looked."""
+    return SourceTree.of_packages(*PACKAGES)
+
+
+@cache
+def code_behind(start: str) -> Code:
+    """The code that is reached from a function, named `module:function`."""
+    return project_source().code_from((start,))
+
 
 SHOWN_DIGITS = 8
 """Digits of a digest, where people read it."""

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli import upkeep
-from flows.cli.output import (
-    Cell,
-    loudness,
-    print_json,
-    print_pairs,
-    print_table,
-)
+from flows.cli.output import Cell, loudness, print_json, print_pairs, print_table
 from flows.cli.rows import opened_row, row_cell, told_explanation
 from flows.cli.shared_options import AsJson, described, tell_run
 from flows.cli.tables import heading_of
@@ -110,7 +104,7 @@ def describe_tables(as_json: AsJson = False) -> None:
     from dataclasses import asdict
 
     from catalog.schemas import TABLES
-    from catalog.table_docs import tables_page
+    from catalog.sql import tables_page
 
     if as_json:
         print_json({"tables": [asdict(table) for table in TABLES.values()]})

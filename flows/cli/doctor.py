@@ -49,13 +49,7 @@ def doctor(
     tell_findings("subject", subject or "environment", findings, as_json=as_json)
 
 
-def tell_findings(
-    kind: str,
-    subject: str,
-    findings: Sequence[Any],
-    *,
-    as_json: bool,
-) -> None:
+def tell_findings(kind: str, subject: str, findings: Sequence[Any], *, as_json: bool) -> None:
     """Print what checks found, as a table or one object; a failure ends the command with code 2.
 
     Args:

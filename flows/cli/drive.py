@@ -57,11 +57,7 @@ def drive(  # noqa: PLR0913 - the options of a command
     from flows.drive import DriveRequest, drive_run
 
     request = DriveRequest(
-        policy=policy,
-        against=against,
-        seconds=seconds,
-        lane_change_m=lane_change,
-        width_px=width,
+        policy=policy, against=against, seconds=seconds, lane_change_m=lane_change, width_px=width
     )
     with shown_progress():
         result = drive_run(existing_store(), run_id, request, out.absolute())

@@ -49,11 +49,7 @@ from lidarpainter_models.errors import ConfigError, LidarPainterError
 BAD_INPUT = 2
 UNEXPECTED = 1
 INTERRUPTED = 130
-LOG_LEVELS: dict[Loudness, str] = {
-    "quiet": "CRITICAL",
-    "usual": "CRITICAL",
-    "verbose": "WARNING",
-}
+LOG_LEVELS: dict[Loudness, str] = {"quiet": "CRITICAL", "usual": "CRITICAL", "verbose": "WARNING"}
 """Log levels of Prefect: its errors reach the user as one line of ours, not as its traceback."""
 GLOBAL_OPTIONS = ("--store",)
 GLOBAL_FLAGS = ("--debug", "--quiet", "--verbose", "-v")

@@ -30,7 +30,7 @@ def settings(
 
     Then: lidarpainter reconstruct pandaset/002 --set fit.densification.budget=100000
     """
-    from flows.setting_lists import known_settings
+    from flows.overrides import known_settings
 
     if of == "train":
         from flows.painter_parameters import TrainPainterParameters

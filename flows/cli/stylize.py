@@ -100,7 +100,7 @@ def _make_styled_run(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> No
     """Make the run in the style and say what it is."""
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.style_run import style_run
+    from flows.derive import style_run
 
     with shown_progress():
         result = style_run(existing_store(), run, mix, seed=seed)

@@ -172,9 +172,7 @@ def verify_store(as_json: AsJson = False) -> None:
 @app.command("export")
 @described(WORDS)
 def export_selection(
-    selection: list[str],
-    out: Annotated[Path, typer.Option()],
-    as_json: AsJson = False,
+    selection: list[str], out: Annotated[Path, typer.Option()], as_json: AsJson = False
 ) -> None:
     """Write runs with all that they need, or scenes, or artefacts, into one tar.
 

@@ -8,11 +8,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import clear_status
-from flows.cli.shared_options import (
-    described,
-    named_run,
-    parse_frames,
-)
+from flows.cli.shared_options import described, named_run, parse_frames
 
 WORDS = """
 view.camera: Camera whose path is followed; the first one fitted to if absent.
@@ -54,10 +50,5 @@ def view(
             webbrowser.open(address)
 
     view_run(
-        existing_store(),
-        run_id,
-        request,
-        port=port,
-        opened_at=opened_at,
-        stopped=threading.Event(),
+        existing_store(), run_id, request, port=port, opened_at=opened_at, stopped=threading.Event()
     )

@@ -32,8 +32,8 @@ from lidarpainter_models.painter.styles import check_prompt
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.ingest.bucket_roots import is_in_bucket
 from tasks.ingest.sequences import find_scene_id, find_sequences
-from tasks.source import code_behind
 from tasks.specs import street_id
+from tasks.stages import code_behind
 from tasks.weights import file_digests
 
 MAX_SEQUENCES = 100_000

@@ -15,10 +15,10 @@ from prefect.settings import PREFECT_API_URL
 from catalog.artefacts import ArtefactRef
 from catalog.store import Store, open_store
 from flows.assets import publish_run
+from flows.derive import style_run
 from flows.fleet.asked import Asked
 from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
-from flows.style_run import style_run
 from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.evaluation.shown import forget_shown

@@ -13,15 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError, model_validator
 
-from flows.fleet.manifest import (
-    STORED,
-    SYNTHETIC,
-    Manifest,
-    Name,
-    SceneName,
-    range_of,
-    read_toml,
-)
+from flows.fleet.manifest import STORED, SYNTHETIC, Manifest, Name, SceneName, range_of, read_toml
 from flows.measure.figures import AT_END, COSTS, check_figure, measured_as
 from lidarpainter_models.errors import ConfigError
 from tasks.specs import street_id

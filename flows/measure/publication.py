@@ -142,11 +142,7 @@ class Publisher:
             hint = f"; {fleet.missing}" if fleet.missing else ""
             return {}, f"{error}{hint}"
         points, missing = make_points(
-            fleet,
-            self.store,
-            workers=self.workers,
-            accept_stale=self.accept_stale,
-            say=self.say,
+            fleet, self.store, workers=self.workers, accept_stale=self.accept_stale, say=self.say
         )
         return _by_name(fleet, points), undone(points, missing) if missing else None
 

@@ -18,10 +18,7 @@ from tasks.ingest.spoil import ingest_spoilt, spoilt_id
 from tasks.opened import open_scene
 
 PAINTED, UNPAINTED = "painted", "unpainted"
-WAYS = (
-    Configuration(name=PAINTED),
-    Configuration(name=UNPAINTED, painter="none"),
-)
+WAYS = (Configuration(name=PAINTED), Configuration(name=UNPAINTED, painter="none"))
 """The unpainted scene is fitted as long."""
 PUBLISHED: tuple[Publication, ...] = ("scores", "examination")
 QUALITIES = ("aside_psnr", "recorded_psnr")
@@ -56,12 +53,7 @@ def trials_of(
     """
     opened = {scene: open_scene(store, scene) for scene in scenes}
     return [
-        Trial(
-            scene=scene,
-            cause=name,
-            level=level,
-            spoilt=spoilt_id(opened[scene], name, level),
-        )
+        Trial(scene=scene, cause=name, level=level, spoilt=spoilt_id(opened[scene], name, level))
         for name in causes
         for scene in scenes
         for level in cause_of(name).levels_of(len(opened[scene].camera_names))[:num_levels]
@@ -180,10 +172,7 @@ class _Curve:
 
 
 def _curves(
-    trials: Sequence[Trial],
-    cause: str,
-    figures: Mapping[tuple[str, str], _Trials],
-    quality: str,
+    trials: Sequence[Trial], cause: str, figures: Mapping[tuple[str, str], _Trials], quality: str
 ) -> list[_Curve]:
     """The curves of all scenes that have the cause and the figure."""
     curves = []

@@ -177,9 +177,7 @@ def _sky(source: AssetSource, output: Path) -> Record:
     folder = "sky"
     (output / folder).mkdir()
     write_tensors(
-        output / folder / SKY_FILE,
-        {"rgb": rgb, "weight": sky.weight},
-        asdict(sky.layout),
+        output / folder / SKY_FILE, {"rgb": rgb, "weight": sky.weight}, asdict(sky.layout)
     )
     step = max(1, math.ceil(len(rgb) / SKY_ROWS))
     thumbnail = f"{folder}/{THUMBNAIL_FILE}"

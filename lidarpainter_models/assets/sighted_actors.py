@@ -32,9 +32,7 @@ class RecordedLook:
 
 
 def sighted_actors(
-    world: EditedWorld,
-    looks: Sequence[RecordedLook],
-    progress: Callable[[int, int], None],
+    world: EditedWorld, looks: Sequence[RecordedLook], progress: Callable[[int, int], None]
 ) -> dict[str, Sighting]:
     """What the images of a run show of each of its actors, parked ones too, by id."""
     tracks = [as_moving(track, world.log) for track in world.tracks]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
+from lidarpainter_models.checks.sweeps import LidarReach, could_any_hit, reaches_of
 from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points

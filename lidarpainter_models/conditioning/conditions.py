@@ -155,9 +155,7 @@ class ConditionBuilder:
             return source
         return source.without(view.hidden.to(device), render.rgb)
 
-    def sources_for(
-        self, camera: Camera, timestamp_ns: int, *, exclude: frozenset[ViewKey] = frozenset()
-    ) -> tuple[SourceImage, ...]:
+    def sources_for(self, camera: Camera, timestamp_ns: int) -> tuple[SourceImage, ...]:
         """The images a view is patched from: nearest first, then spread over all others.
 
         Neighbours of a slow drive show the same; images further off see round corners and
@@ -165,38 +163,34 @@ class ConditionBuilder:
         """
         costs_m = source_costs_m(camera, timestamp_ns, *self._placed)
         nearest = sorted(zip(costs_m.tolist(), self._views, strict=True), key=itemgetter(0))
-        allowed = [key for _, key in nearest if key not in exclude]
-        near = min(self.config.num_references, len(allowed))
-        rest = allowed[near:]
+        keys = [key for _, key in nearest]
+        near = min(self.config.num_references, len(keys))
+        rest = keys[near:]
         num_rest = min(self.config.num_sources - near, len(rest))
         spread = [rest[round((i + 1) * len(rest) / num_rest) - 1] for i in range(num_rest)]
-        return tuple(self.source(key) for key in (*allowed[:near], *spread))
+        return tuple(self.source(key) for key in (*keys[:near], *spread))
 
     def conditions(
         self,
         camera: Camera,
         timestamp_ns: int,
         *,
-        exclude: frozenset[ViewKey] = frozenset(),
         camera_name: str | None = None,
         prompt: str = DEFAULT_PROMPT,
     ) -> PaintingConditions:
         """Gather what is known about a view.
 
-        The camera is taken as it stands: correct it first if it was recorded. Views of `exclude`
-        serve as no references; all images take the exposure of `camera_name`.
+        The camera is taken as it stands: correct it first if it was recorded. All images take the
+        exposure of `camera_name`.
         """
         render = self.scene.render(camera, timestamp_ns)
         timestamp_ns = camera.taken_ns(timestamp_ns)
         lidar = self.lidar_image(camera, timestamp_ns)
         is_sky = (render.alpha < SKY_ALPHA) & (lidar.depth_m == 0)
-        sources = self.sources_for(camera, timestamp_ns, exclude=exclude)
+        sources = self.sources_for(camera, timestamp_ns)
         references = warped_references(
             WarpTarget(
-                camera,
-                timestamp_ns,
-                [self.surface_m(render, lidar, camera), lidar.depth_m],
-                is_sky,
+                camera, timestamp_ns, [self.surface_m(render, lidar, camera), lidar.depth_m], is_sky
             ),
             sources,
             self.boxes,

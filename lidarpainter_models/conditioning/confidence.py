@@ -63,9 +63,7 @@ MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gate
 
 
 def is_seen(
-    camera: Camera,
-    depth_m: Float[Tensor, "height width"],
-    recorded_cameras: Iterable[Camera],
+    camera: Camera, depth_m: Float[Tensor, "height width"], recorded_cameras: Iterable[Camera]
 ) -> Bool[Tensor, "height width"]:
     """Whether the point in each pixel falls into any recorded image, occluded or not.
 
@@ -135,11 +133,7 @@ def view_support(
 def _distance_px(
     hit: Bool[Tensor, "height width"], reach_px: float
 ) -> Float[Tensor, "height width"]:
-    """Distance of each pixel to the nearest hit one; infinite if there is none.
-
-    On a device exact up to many times the reach, where support ends: along columns first, then
-    the best of the rows around.
-    """
+    """Distance of each pixel to the nearest hit one; infinite if there is none."""
     if may_run_on_host(hit.device):
         if not bool(hit.any()):
             return torch.full(hit.shape, torch.inf)

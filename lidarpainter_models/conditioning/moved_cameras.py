@@ -76,18 +76,13 @@ class MovedCameras:
         if self.trajectory.is_recorded:
             return []
         body = MovingBody.camera(
-            torch.stack([camera.world_from_camera.double() for camera in cameras]),
-            _times_ns(views),
+            torch.stack([camera.world_from_camera.double() for camera in cameras]), _times_ns(views)
         )
         start_ns = int(self.road.timestamps_ns[0])
         return find_collisions(body, street, self.tracks, start_ns=start_ns)
 
     def _road_of(self, views: Sequence[RecordedView | Sweep]) -> DrivenPath:
-        """The way that a trajectory leads off.
-
-        Where another path takes its place it has a pose at every exposure: frames have other times,
-        and a camera rides where it was when it was exposed.
-        """
+        """The way that a trajectory leads off."""
         if self.trajectory.other is None:
             return self.road
         times_ns = torch.cat([self.road.timestamps_ns, _times_ns(views)]).unique()

@@ -234,10 +234,7 @@ def _merged(finds: list[_Find]) -> _Find:
 def _ego_lamps(
     recorded: DrivingScene, first: TrainingView, camera_height_m: float
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 3"]]:
-    """Place between the headlamps and heading of the car that recorded, frame by frame.
-
-    The lamps are taken to be a little before the camera that is looked through first.
-    """
+    """Place between the headlamps and heading of the car that recorded, frame by frame."""
     world_from_ego = recorded.world_from_ego.double()
     times = recorded.frame_timestamps_ns
     frame = int((times - first.timestamp_ns).abs().argmin())

@@ -60,10 +60,7 @@ class EvidenceGatherer:
     """Measures what speaks for views of one scene."""
 
     def __init__(
-        self,
-        scene: GaussianScene,
-        lidar_map: LidarMap,
-        training_views: Sequence[TrainingView],
+        self, scene: GaussianScene, lidar_map: LidarMap, training_views: Sequence[TrainingView]
     ) -> None:
         """Take the scene as it is now, and what the fit saw."""
         self.scene = scene

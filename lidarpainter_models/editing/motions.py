@@ -60,11 +60,7 @@ class LogTimes:
 
 
 def rerouted(
-    track: ActorTrack,
-    trajectory: Trajectory,
-    log: LogTimes,
-    ground: GroundHeights,
-    path_of: PathOf,
+    track: ActorTrack, trajectory: Trajectory, log: LogTimes, ground: GroundHeights, path_of: PathOf
 ) -> ActorTrack:
     """An actor on another way, as high over the ground as it was."""
     road = path_of_track(track)

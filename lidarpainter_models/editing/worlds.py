@@ -159,11 +159,7 @@ class EditedWorld:
         own, actors = self.scene.gaussians, self.scene.actors
         coming = model.gaussians.of_body(len(actors.recorded_tracks) + 1)
         moving = replace(track, is_moving=True, size_m=model.size_m)
-        scene = replace(
-            self.scene,
-            gaussians=own.append(coming),
-            actors=actors.with_rigid(moving),
-        )
+        scene = replace(self.scene, gaussians=own.append(coming), actors=actors.with_rigid(moving))
         # of its own: a copy of somebody here would share tensors, which a file cannot hold twice
         its_points = model.points.keep(torch.arange(len(model.points)))
         points = {**self.lidar_map.actors, track.actor_id: its_points}

@@ -39,7 +39,7 @@ UP_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 ASIDE_M = (*UP_M, 6.0)
 AHEAD_M = (*ASIDE_M, 8.0)
 LEVELS_DEG = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
-"""No farther than frames were drawn to calibrate what is promised (`confidence_trials`)."""
+"""No farther than frames were drawn to calibrate what is promised."""
 Direction = tuple[tuple[float, ...], Callable[[float], ConstantStep]]
 DIRECTIONS: dict[str, Direction] = {
     "left_m": (ASIDE_M, lambda level: ConstantStep(lateral_m=level)),

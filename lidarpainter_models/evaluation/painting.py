@@ -16,15 +16,46 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.kernels.ssim import ssim_map
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 from lidarpainter_models.metrics.perceptual import ImageDistance
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
-from lidarpainter_models.painter.examples import PaintingPair
-from lidarpainter_models.painter.input_hull import input_hull
+from lidarpainter_models.painter.examples import PaintingPair, PairSource
+from lidarpainter_models.painter.filters import input_hull
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
+
+NUM_SAMPLES = 4
+
+
+def painting_samples(
+    painter: Painter, sources: Mapping[str, PairSource]
+) -> Float[Tensor, "height width 3"]:
+    """A row per pair: render, LiDAR, painted, true image; the pairs lie evenly over all sources.
+
+    Raises:
+        DataError: a pair is damaged.
+    """
+    known = [(source, index) for source in sources.values() for index in range(len(source))]
+    count = min(NUM_SAMPLES, len(known))
+    chosen = [known[rank * len(known) // count] for rank in range(count)]
+    rows = [_row(painter, source, index) for source, index in chosen]
+    width_px = max(row.shape[1] for row in rows)
+    return torch.cat([_widened(row, width_px) for row in rows])
+
+
+def _row(painter: Painter, source: PairSource, index: int) -> Float[Tensor, "height width 3"]:
+    pair = source.read(index)
+    seen = pair.conditions
+    painted = painter.paint(seen).rgb
+    return torch.cat([seen.render_rgb, seen.lidar_rgb, painted, pair.target_rgb], dim=1)
+
+
+def _widened(row: Float[Tensor, "height width 3"], width_px: int) -> Float[Tensor, "height wide 3"]:
+    return functional.pad(row, (0, 0, 0, width_px - row.shape[1]))
+
 
 DAMAGED_ERROR = 0.1
 """A pixel is damaged where the error of the render is above this."""

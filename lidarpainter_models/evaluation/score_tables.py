@@ -52,9 +52,7 @@ def metric_values(
     return [*found, *_trusted(scores.get(ENVELOPE))]
 
 
-def _by_part(
-    scores: Mapping[str, Any],
-) -> list[tuple[str, str, str, float | None, str | None]]:
+def _by_part(scores: Mapping[str, Any]) -> list[tuple[str, str, str, float | None, str | None]]:
     """Numbers of what was not judged as held-out views are, by camera, path or protocol."""
     name_of = next(
         (name for name in (NEURAD, LIDAR, FLICKER, MARKINGS) if name in scores), "cross-camera"

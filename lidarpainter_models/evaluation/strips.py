@@ -24,10 +24,7 @@ from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.view_scores import Renderer
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import (
-    rigid_from_tangent,
-    rotation_from_vector,
-)
+from lidarpainter_models.geometry.transforms import rigid_from_tangent, rotation_from_vector
 from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.metrics.depth import visible_points
@@ -196,9 +193,7 @@ def calibrate_strip(render: Renderer, views: Sequence[StripView]) -> StripCalibr
 
 
 def score_strips(
-    render: Renderer,
-    views: Sequence[StripView],
-    calibration: StripCalibration,
+    render: Renderer, views: Sequence[StripView], calibration: StripCalibration
 ) -> StripScores:
     """Score held-out frames of the judging camera on the strip."""
     affine = torch.tensor(calibration.affine)
@@ -278,11 +273,7 @@ class StripEvaluation:
             return shows(camera, timestamp_ns).cpu()  # strips are cut and turned there
 
         views_of = partial(
-            strip_views,
-            self.held_out,
-            shown.scene,
-            judging_camera=camera,
-            fitted_camera=neighbour,
+            strip_views, self.held_out, shown.scene, judging_camera=camera, fitted_camera=neighbour
         )
         try:
             calibration = calibrate_strip(render, views_of(frames=self.views.train_frames))

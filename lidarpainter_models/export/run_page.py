@@ -100,11 +100,7 @@ class RunPage:
                 *_actors(scene, pictures.actor_gaussians, self.result["recorded"] or {}),
             ],
             plots=_plots(histories),
-            facts={
-                "Provenance": self.provenance,
-                "Machine": machine,
-                "Settings": self.settings,
-            },
+            facts={"Provenance": self.provenance, "Machine": machine, "Settings": self.settings},
         )
 
     def _estimated(self) -> list[str]:

@@ -15,11 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lidarpainter_models.conditioning.followed_paths import (
-    FollowedPath,
-    ShownMoment,
-    image_record,
-)
+from lidarpainter_models.conditioning.followed_paths import FollowedPath, ShownMoment, image_record
 from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
 from lidarpainter_models.export.videos import images_per_second, video_file
@@ -127,9 +123,7 @@ class _Written(NamedTuple):
 
 
 def _written(
-    paths: Sequence[FollowedPath],
-    folders: Sequence[Path],
-    delivery: Delivery,
+    paths: Sequence[FollowedPath], folders: Sequence[Path], delivery: Delivery
 ) -> Iterator[_Written]:
     """Write all views, moment by moment; several at once where none leans on the one before."""
     moments = sorted(

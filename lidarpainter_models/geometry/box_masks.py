@@ -39,9 +39,7 @@ class BoxOutline:
 
 
 def box_outlines(
-    camera: Camera,
-    world_from_boxes: Float[Tensor, "boxes 4 4"],
-    sizes_m: Float[Tensor, "boxes 3"],
+    camera: Camera, world_from_boxes: Float[Tensor, "boxes 4 4"], sizes_m: Float[Tensor, "boxes 3"]
 ) -> list[BoxOutline]:
     """Outlines of the boxes that reach into the image, in their order."""
     camera_from_box = (camera.camera_from_world.double() @ world_from_boxes.double()).numpy()

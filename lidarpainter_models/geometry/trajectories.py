@@ -41,9 +41,7 @@ def road_directions(world_from_ego: Float[Tensor, "frames 4 4"]) -> Float[Tensor
 
 
 def shift_pose(
-    world_from_camera: Float[Tensor, "4 4"],
-    road_direction: Float[Tensor, "3"],
-    shift: Shift,
+    world_from_camera: Float[Tensor, "4 4"], road_direction: Float[Tensor, "3"], shift: Shift
 ) -> Float[Tensor, "4 4"]:
     """The camera pose moved sideways and up relative to the road, and turned about up."""
     up = torch.tensor([0.0, 0.0, 1.0], dtype=world_from_camera.dtype)

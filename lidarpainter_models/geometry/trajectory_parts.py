@@ -78,11 +78,7 @@ def offsets_of(step: Step, moments: Moments, road: DrivenPath) -> Offsets:
 
 
 def other_poses(
-    path: PathWords,
-    waypoints: Waypoints | None,
-    moments: Moments,
-    own: DrivenPath,
-    path_of: PathOf,
+    path: PathWords, waypoints: Waypoints | None, moments: Moments, own: DrivenPath, path_of: PathOf
 ) -> Float[Tensor, "moments 4 4"]:
     """Where a body is that follows another path than the recorded one, `own`.
 

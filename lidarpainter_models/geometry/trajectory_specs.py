@@ -148,9 +148,7 @@ def parse_trajectory(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> T
 
 
 def _moved_aside(
-    bodies: Float[Tensor, "moments 4 4"],
-    directions: Float[Tensor, "moments 3"],
-    offsets: Offsets,
+    bodies: Float[Tensor, "moments 4 4"], directions: Float[Tensor, "moments 3"], offsets: Offsets
 ) -> Float[Tensor, "moments 4 4"]:
     """Poses moved left and up relative to the road, and turned about up where they are."""
     up = torch.tensor([0.0, 0.0, 1.0], dtype=bodies.dtype)

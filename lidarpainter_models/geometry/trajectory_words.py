@@ -194,11 +194,7 @@ _WORDS = (
         lambda found, _spec: PathWords(actor=found["name"], looks=True),
     ),
     TrajectoryWord(
-        "birdseye",
-        "[:METRES]",
-        "down on the car from above",
-        r"(?::(?P<number>.*))?",
-        _birdseye,
+        "birdseye", "[:METRES]", "down on the car from above", r"(?::(?P<number>.*))?", _birdseye
     ),
 )
 TRAJECTORY_WORDS: Mapping[str, TrajectoryWord] = {word.name: word for word in _WORDS}

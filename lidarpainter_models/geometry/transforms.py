@@ -14,8 +14,7 @@ from lidarpainter_models.errors import ShapeError
 
 
 def transform_points(
-    target_from_source: Float[Tensor, "4 4"],
-    points_source: Float[Tensor, "points 3"],
+    target_from_source: Float[Tensor, "4 4"], points_source: Float[Tensor, "points 3"]
 ) -> Float[Tensor, "points 3"]:
     """Express source-frame points in the target frame."""
     rotation, translation = target_from_source[:3, :3], target_from_source[:3, 3]
@@ -54,9 +53,7 @@ def rotation_from_quaternion(
     ).unflatten(-1, (3, 3))
 
 
-def quaternion_from_rotation(
-    rotation: Float[Tensor, "*batch 3 3"],
-) -> Float[Tensor, "*batch 4"]:
+def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions (w >= 0) of rotation matrices.
 
     Of the four candidate formulas the one with the largest divisor is taken (Shepperd, 1978).
@@ -145,9 +142,7 @@ def interpolate_rigid(
 
 
 def interpolate_rigid_track(
-    timestamps_ns: torch.Tensor,
-    world_from_body: Float[Tensor, "times 4 4"],
-    query_ns: int,
+    timestamps_ns: torch.Tensor, world_from_body: Float[Tensor, "times 4 4"], query_ns: int
 ) -> Float[Tensor, "4 4"]:
     """Pose of a track (ascending times) at one time; beyond its ends the end pose holds.
 

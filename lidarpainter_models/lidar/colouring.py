@@ -83,10 +83,7 @@ class ImageLevels:
 
 
 def rim_samples(
-    levels: ImageLevels,
-    points: PointsInView,
-    visibility: Visibility,
-    grid: CellGrid,
+    levels: ImageLevels, points: PointsInView, visibility: Visibility, grid: CellGrid
 ) -> tuple[UInt8[Tensor, "points 3"], Float[Tensor, " points"]]:
     """Colours of visible points, and how far the place of each is to be trusted.
 
@@ -218,10 +215,7 @@ class MapColouring:
         return _visibility(PointsInView.joined([PointsInView.none(), *solid]), grid, actors)
 
     def _may_gain(self, inside: PointsInView, camera: Camera) -> Int[Tensor, " points"]:
-        """Of the points in an image, those that have no better samples from others already.
-
-        What others are adding meanwhile can only make it fewer.
-        """
+        """Of the points in an image, those that have no better samples from others already."""
         least = torch.from_numpy(self._samples.weight[:, -1])[inside.rows]
         return (_weight(torch.ones(len(inside)), inside, camera) > least).nonzero()[:, 0]
 

@@ -18,12 +18,7 @@ CELL_M, QUANTILE = 1.0, 0.1
 class GroundHeights:
     """Looks up the ground under a place; where no point fell it is unknown (NaN)."""
 
-    def __init__(
-        self,
-        xyz_m: Float[Tensor, "points 3"],
-        *,
-        least_points: int = 4,
-    ) -> None:
+    def __init__(self, xyz_m: Float[Tensor, "points 3"], *, least_points: int = 4) -> None:
         """Sort points into square cells and take a quantile of each cell with enough of them."""
         keys = self._keys(xyz_m[:, :2])
         by_height = torch.argsort(xyz_m[:, 2])

@@ -188,8 +188,7 @@ def _image(
 ) -> HubImage:
     share = min(1.0, WIDTH_PX / view.camera.width_px)
     camera = view.camera.resized(
-        width_px=round(view.camera.width_px * share),
-        height_px=round(view.camera.height_px * share),
+        width_px=round(view.camera.width_px * share), height_px=round(view.camera.height_px * share)
     )
     size = (camera.width_px, camera.height_px)
     rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)

@@ -180,10 +180,7 @@ def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:
 def _sort_near_points(
     placed: _PlacedSweep, tracks: Sequence[ActorTrack], ground: GroundHeights
 ) -> tuple[MapPoints, dict[str, MapPoints]]:
-    """Of the points near actors: the road under them, and the points of each actor.
-
-    What is neither (the margin around an actor, tyres where they touch the road) is dropped.
-    """
+    """Of the points near actors: the road under them, and the points of each actor."""
     near, beside = placed.near, placed.beside
     height_m = height_above_ground(beside.xyz_m, near.bottom_m, ground)
     road = beside.keep(height_m < ROAD_HEIGHT_M)

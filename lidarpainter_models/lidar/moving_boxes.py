@@ -51,9 +51,7 @@ class MovingBoxes:
         return [(track, pose) for is_there, track, pose in everybody if is_there]
 
     def owners(
-        self,
-        points_world: Float[Tensor, "points 3"],
-        timestamp_ns: int,
+        self, points_world: Float[Tensor, "points 3"], timestamp_ns: int
     ) -> Int[Tensor, " points"]:
         """Index of the actor that holds each point at a time, or `BACKGROUND`.
 

@@ -66,11 +66,7 @@ def surface_visibility(
     The cells are pixels of `grid`; `box_m` is as `box_far_ends` gives it.
     """
     seen = splat_points(
-        cells_uv,
-        depth_m,
-        height_px=grid.height_px,
-        width_px=grid.width_px,
-        radius_px=radius_px,
+        cells_uv, depth_m, height_px=grid.height_px, width_px=grid.width_px, radius_px=radius_px
     )
     is_surface = (seen >= 0).numpy()
     depth = np.append(depth_m.numpy(), np.float32(_FAR_M))[seen.numpy()]  # -1 is the last

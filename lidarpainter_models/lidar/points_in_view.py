@@ -159,10 +159,7 @@ def place_actors(
 
 
 def points_in_view(
-    bodies: Sequence[Body],
-    camera: Camera,
-    timestamp_ns: int,
-    actors: PlacedActors,
+    bodies: Sequence[Body], camera: Camera, timestamp_ns: int, actors: PlacedActors
 ) -> Iterator[PointsInView]:
     """Where the points of all bodies stand in an image taken at a time; absent actors have none.
 

@@ -133,10 +133,7 @@ def _like_the_largest(image: np.ndarray, pieces: np.ndarray, sigma_px: float) ->
 
 
 def _differs(image: np.ndarray, sky: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Largest channel difference from the sky around, averaged near and, failing that, far.
-
-    The averages are smooth, so they are taken on a quarter of the grid.
-    """
+    """Largest channel difference from the sky around, averaged near and, failing that, far."""
     height, width = sky.shape
     size = (max(1, width // 4), max(1, height // 4))
     share = cv2.resize(sky.astype(np.float32), size, interpolation=cv2.INTER_AREA)

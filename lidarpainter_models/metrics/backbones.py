@@ -115,10 +115,7 @@ def alexnet_stack() -> FeatureStack:
 
 BACKBONES = (
     Backbone(
-        name="VGG-16",
-        build=vgg16_stack,
-        channels=(64, 128, 256, 512, 512),
-        published=("397923af",),
+        name="VGG-16", build=vgg16_stack, channels=(64, 128, 256, 512, 512), published=("397923af",)
     ),
     Backbone(
         name="AlexNet",
@@ -179,3 +176,45 @@ def load_stack(path: Path, backbone: Backbone) -> FeatureStack:
             )
     stack.load_state_dict({name: named[name].float() for name in stack.state_dict()})
     return stack.eval().requires_grad_(requires_grad=False)
+
+
+CHANNEL_MEAN_BGR = (103.939, 116.779, 123.68)
+"""Subtracted from BGR images in 0..255 before the first convolution."""
+
+
+class SqueezeNetDistance(nn.Module):
+    """Distance between two images in the feature spaces of SqueezeNet 1.1."""
+
+    def __init__(self, layers: FeatureStack) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def features(
+        self, rgb: Float[Tensor, "height width 3"]
+    ) -> list[Float[Tensor, "1 channels rows columns"]]:
+        """Channel-normalised features at the compared depths."""
+        bgr = rgb.flip(-1) * 255 - torch.tensor(CHANNEL_MEAN_BGR, device=rgb.device)
+        return self.layers.compared_features(bgr.permute(2, 0, 1)[None])
+
+    def forward(
+        self, image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, ""]:
+        """The distance; 0 for equal images."""
+        pairs = zip(self.features(image), self.features(truth), strict=True)
+        return torch.stack([(a - b).square().sum(1).mean() for a, b in pairs]).sum()
+
+
+def load_squeezenet_distance(path: Path) -> SqueezeNetDistance:
+    """Read SqueezeNet 1.1 feature weights (torchvision key names, `features.` optional).
+
+    Raises:
+        WeightsError: the file is missing, unreadable, holds another network, or is torchvision's,
+            which was trained on other colours.
+    """
+    layers = load_stack(path, SQUEEZENET)
+    if is_published(path, SQUEEZENET):
+        raise WeightsError(
+            f"{path} is torchvision's SqueezeNet 1.1, a backbone of LPIPS; the feature distance "
+            "needs the weights its authors trained in Caffe"
+        )
+    return SqueezeNetDistance(layers).eval().requires_grad_(requires_grad=False)

@@ -20,8 +20,7 @@ MIN_PIXELS = 100
 
 
 def squared_error(
-    image: Float[Tensor, "height width 3"],
-    truth: Float[Tensor, "height width 3"],
+    image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
     """Squared error per pixel, averaged over the channels; the image is clamped to [0, 1].
 

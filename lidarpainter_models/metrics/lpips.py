@@ -54,9 +54,7 @@ class Lpips(nn.Module):
         return self.of_batch(one, other)[0]
 
     def of_batch(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        truths: Float[Tensor, "batch 3 _ _"],
+        self, images: Float[Tensor, "batch 3 height width"], truths: Float[Tensor, "batch 3 _ _"]
     ) -> Float[Tensor, " batch"]:
         """The distances of a batch.
 

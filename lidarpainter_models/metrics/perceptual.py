@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.metrics.backbones import load_squeezenet_distance
 from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 
 ImageDistance = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]

@@ -82,10 +82,7 @@ def points_from_images(
         part
         for name in scene.camera_names
         for part in _of_camera(
-            scene,
-            boxes,
-            [view for view in views if view.camera_name == name],
-            own_bodies.get(name),
+            scene, boxes, [view for view in views if view.camera_name == name], own_bodies.get(name)
         )
     ]
     street = MapPoints.concatenate(parts)
@@ -137,10 +134,7 @@ def _made_ready(
     if own_body is not None:
         moves |= on_grid(own_body, width_px=camera.width_px, height_px=camera.height_px)
     return _Image(
-        view=view,
-        camera=camera,
-        contrast=torch.from_numpy(contrast)[..., None],
-        moves=moves,
+        view=view, camera=camera, contrast=torch.from_numpy(contrast)[..., None], moves=moves
     )
 
 

@@ -214,10 +214,7 @@ def _seen_change(
 def _what_stays(
     seen: Sequence[tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]],
 ) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Pixels on the same edge in most of the images that count, and in nearly all of them.
-
-    An edge is the same where it has the same sign, or where it stands out from its surroundings.
-    """
+    """Pixels on the same edge in most of the images that count, and in nearly all of them."""
     total = np.maximum(sum(counts.astype(int) for _, counts in seen), 1)
     sign = np.sign(sum(change * counts for change, counts in seen))
     held = sum((sign * change > LEAST_EDGE) & counts for change, counts in seen)
@@ -261,10 +258,7 @@ def _enclosed(
     *,
     only_wide: bool,
 ) -> Bool[np.ndarray, "height width"]:
-    """What groups of edges near the border of the image enclose with that border.
-
-    Where none goes across the image, they may together: a car ahead hides the middle of a bonnet's.
-    """
+    """What groups of edges near the border of the image enclose with that border."""
     height, width = edges.shape
     body = np.zeros((height, width), np.uint8)
     outlines: list[np.ndarray | None] = []

@@ -110,10 +110,7 @@ def _read(
     config: AugmentationConfig,
     generator: Generator,
 ) -> PaintingPair:
-    """A window of a pair, its target in a style that is drawn if there are any.
-
-    Airlight, glow and lamps belong to the whole image, so that is styled before it is cut.
-    """
+    """A window of a pair, its target in a style that is drawn if there are any."""
     if len(prompts) == 1 or float(torch.rand((), generator=generator)) >= config.style_share:
         return source.read(index, window)
     chosen = 1 + int(torch.randint(len(prompts) - 1, (), generator=generator))
@@ -277,9 +274,6 @@ def target_view(pair: PaintingPair) -> StyleView:
 
 
 def _sky(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
-    """What the Gaussians leave open, above the topmost LiDAR hit of its column.
-
-    Below it, what is open is a hole of the render.
-    """
+    """What the Gaussians leave open, above the topmost LiDAR hit of its column."""
     below_a_hit = conditions.lidar_hit.int().cumsum(dim=0) > 0
     return torch.where(below_a_hit, 0.0, 1 - conditions.render_alpha.clamp(0, 1))

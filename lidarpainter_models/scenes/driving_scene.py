@@ -205,8 +205,7 @@ class DrivingScene:
         moved.views = corrections.of_views(self.views)
         moved.sweeps = tuple(
             replace(
-                sweep,
-                world_from_lidar=corrections.at(sweep.timestamp_ns) @ sweep.world_from_lidar,
+                sweep, world_from_lidar=corrections.at(sweep.timestamp_ns) @ sweep.world_from_lidar
             )
             for sweep in self.sweeps
         )
@@ -267,9 +266,7 @@ def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:
 
 
 def image_of_row(
-    row: Mapping[str, Any],
-    world_from_camera: Float[Tensor, "4 4"],
-    shutter: Shutter | None = None,
+    row: Mapping[str, Any], world_from_camera: Float[Tensor, "4 4"], shutter: Shutter | None = None
 ) -> ImageRecord:
     """What a row of the table of images says of one; `shutter` is how its camera moved."""
     read = ("duration_s", "direction", "first_row_s")

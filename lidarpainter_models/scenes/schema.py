@@ -75,12 +75,7 @@ CAMERAS = (
     Column("cx_px", pa.float64(), "px", "principal point; the first pixel's centre is 0.5"),
     Column("cy_px", pa.float64(), "px", "principal point; the first pixel's centre is 0.5"),
     Column("distortion_model", pa.string(), "", "none, brown, fisheye, mei: as in OpenCV"),
-    Column(
-        "distortion_terms",
-        pa.list_(pa.float64()),
-        "1",
-        "in OpenCV's order; mei: xi first",
-    ),
+    Column("distortion_terms", pa.list_(pa.float64()), "1", "in OpenCV's order; mei: xi first"),
     Column("width_px", pa.int64(), "px", "width of the stored image"),
     Column("height_px", pa.int64(), "px", "height of the stored image"),
     Column("rolling_shutter_s", pa.float64(), "s", "first to last row read", is_optional=True),

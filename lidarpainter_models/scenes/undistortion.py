@@ -193,11 +193,7 @@ def _landed(
 
 
 def _middle(lens: Camera, distortion: Distortion) -> Camera:
-    """The widest pinhole of which every pixel falls into the image, once.
-
-    Raises:
-        ConfigError: not even `NARROWEST_DEG` of the lens can be shown.
-    """
+    """The widest pinhole of which every pixel falls into the image, once."""
     longer_px = max(lens.width_px, lens.height_px)
     centred = replace(lens, cx_px=lens.width_px / 2, cy_px=lens.height_px / 2)
 

@@ -85,8 +85,7 @@ class Frame:
                 turn,
                 sweep=replace(turn.sweep, world_from_lidar=motion @ turn.sweep.world_from_lidar),
                 points=replace(
-                    turn.points,
-                    xyz_m=transform_points(motion, turn.points.xyz_m.double()).float(),
+                    turn.points, xyz_m=transform_points(motion, turn.points.xyz_m.double()).float()
                 ),
             )
             for turn in self.turns

@@ -44,10 +44,7 @@ def write_street(
 
 
 def record_street(
-    street: SyntheticStreet,
-    store: Path,
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    street: SyntheticStreet, store: Path, *, progress: Callable[[int, int], None] | None = None
 ) -> Path:
     """Record a street that is drawn already, as `write_street` does."""
     config = street.config
@@ -119,10 +116,7 @@ def _record_image(
 
 
 def _record_boxes(
-    street: SyntheticStreet,
-    sweep: SimulatedSweep,
-    rng: np.random.Generator,
-    writer: SceneWriter,
+    street: SyntheticStreet, sweep: SimulatedSweep, rng: np.random.Generator, writer: SceneWriter
 ) -> None:
     """Every actor's box at the time of the sweep, with the points that hit the actor."""
     config = street.config

@@ -80,11 +80,7 @@ class SyntheticStreet:
 
     def to_generator(self) -> dict[str, Any]:
         """What `from_manifest` needs, JSON-able."""
-        return {
-            "name": GENERATOR,
-            "world_version": WORLD_VERSION,
-            "config": self.config.to_dict(),
-        }
+        return {"name": GENERATOR, "world_version": WORLD_VERSION, "config": self.config.to_dict()}
 
     @cached_property
     def timestamps_ns(self) -> tuple[int, ...]:

@@ -235,11 +235,7 @@ def _encode(pair: PaintingPair, provenance: dict[str, Any]) -> bytes:
         elif kind == "depth":
             value = value.clamp(0, LARGEST_DEPTH_M).to(torch.float16)
         tensors[name] = value.to(torch.uint8 if kind == "mask" else value.dtype).contiguous()
-    header = {
-        "format": PAIR_FORMAT,
-        "prompt": pair.conditions.prompt,
-        "provenance": provenance,
-    }
+    header = {"format": PAIR_FORMAT, "prompt": pair.conditions.prompt, "provenance": provenance}
     return pack_tensors(tensors, header)
 
 

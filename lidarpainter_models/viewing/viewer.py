@@ -51,10 +51,7 @@ class LiveViewer:
     """A drive, its nodes and its panel."""
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        drive: ShownDrive,
-        painting: ViewTimePainting | None = None,
+        self, server: viser.ViserServer, drive: ShownDrive, painting: ViewTimePainting | None = None
     ) -> None:
         """Send the drive's first moment, and answer the panel from now on.
 
@@ -151,9 +148,7 @@ class LiveViewer:
                 continue
             camera = scene.refined_camera(view, fit_camera(view, size))
             rgb_u8 = shrink_image(
-                path.recorded.read_image(view),
-                width_px=camera.width_px,
-                height_px=camera.height_px,
+                path.recorded.read_image(view), width_px=camera.width_px, height_px=camera.height_px
             )
             self._rig.place(view.camera_name, camera, rgb_u8)
             if view.camera_name != in_the_way:
@@ -226,11 +221,7 @@ def _plain(name: str) -> str:
 
 @contextmanager
 def live_viewer(
-    drive: ShownDrive,
-    painting: ViewTimePainting | None,
-    *,
-    label: str,
-    port: int | None,
+    drive: ShownDrive, painting: ViewTimePainting | None, *, label: str, port: int | None
 ) -> Iterator[tuple[LiveViewer, str]]:
     """A viewer and its address, for as long as the block runs.
 

@@ -1,6 +1,6 @@
 """Edit a finished run: who is where, mended where somebody was, masked for painters."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -32,14 +32,41 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, de
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from lidarpainter_models.painter.selection import PainterChoice
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.storage.tensor_files import write_tensors
+from lidarpainter_models.weather.mix import StyleMix
 from tasks.editing.donors import PARKED, digests_of, donor_of, model_of, opened_world
 from tasks.opened import global_frame_of, open_scene
 from tasks.progress import Progress
 from tasks.runs import FinishedRun, open_run
 from tasks.stored import load_observations, load_scene, save_observations, save_scene
+
+
+def put_style(
+    place: Workplace,
+    progress: Progress,
+    *,
+    scene: Callable[[], GaussianScene],
+    observations: Callable[[], SceneObservations],
+    recorded: Callable[[], DrivingScene],
+    mix: StyleMix,
+    seed: int,
+) -> dict[str, Any]:
+    """The build of a styled scene; see `flows.derive`."""
+    styled = styled_scene(
+        scene(),
+        observations(),
+        recorded(),
+        mix,
+        seed=seed,
+        progress=lambda done, total: progress(done, total, "looking for lamps"),
+    )
+    save_scene(place.output, styled, [])
+    return describe(styled)
+
 
 FILLED_FILE = "filled.safetensors"
 """Confidence of the last Gaussians of the scene, which were filled in."""

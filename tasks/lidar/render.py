@@ -5,11 +5,7 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef
 from lidarpainter_models.export.formats import SWEEP_ENDINGS
-from lidarpainter_models.export.simulated_sweeps import (
-    SweepRequest,
-    simulated_sweeps,
-    write_sweep,
-)
+from lidarpainter_models.export.simulated_sweeps import SweepRequest, simulated_sweeps, write_sweep
 from tasks.exports.places import new_folder
 from tasks.exports.sweeps import INDEX_FILE, sweep_record
 from tasks.json_files import write_json

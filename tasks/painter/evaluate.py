@@ -13,10 +13,9 @@ from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import PairSubset, hold_back, learnt_targets
-from lidarpainter_models.evaluation.painting import ScoringPairs, score_painter
-from lidarpainter_models.evaluation.painting_samples import painting_samples
+from lidarpainter_models.evaluation.painting import ScoringPairs, painting_samples, score_painter
 from lidarpainter_models.export.images import write_png
-from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
+from lidarpainter_models.metrics.backbones import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.precision import precision_of
 from lidarpainter_models.painter.protocol import Painter

@@ -9,9 +9,13 @@ from typing import Any
 from catalog.store import open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.errors import ConfigError, DataError
-from lidarpainter_models.evaluation.held_back import unseen_pairs
+from lidarpainter_models.evaluation.held_back import (
+    HeldOutPairs,
+    held_out_pairs,
+    unseen_pairs,
+    unseen_views,
+)
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.held_out_pairs import HeldOutPairs, held_out_pairs, unseen_views
 from lidarpainter_models.evaluation.painting import ScoringPairs
 from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.settings import EvaluationConfig

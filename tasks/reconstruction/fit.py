@@ -16,7 +16,7 @@ import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
-from lidarpainter_models.evaluation.round_gain import round_gain
+from lidarpainter_models.evaluation.scene_evaluation import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import FitProgress, FitResult, fit_gaussians
@@ -29,7 +29,7 @@ from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import opened
 from tasks.progress import Progress, listener
-from tasks.reconstruction.painted_views import load_guidance
+from tasks.reconstruction.paint import load_guidance
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import load_observations, load_scene, save_scene
@@ -105,11 +105,7 @@ def refine(
 
     The summary's `gain` says whether the round is to be taken back; it is kept here all the same.
     """
-    inputs = {
-        "observations": fitted.observations,
-        "start": fitted.gaussians,
-        "guidance": guidance,
-    }
+    inputs = {"observations": fitted.observations, "start": fitted.gaussians, "guidance": guidance}
     return _stage(run, stage, config, lpips, inputs, _build_round)
 
 

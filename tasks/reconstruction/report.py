@@ -104,10 +104,7 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     painted = painting()
     pictures = _pictures(held_out, unpainted(), painted, shifts, said, progress)
     report = replace(page, is_estimated=observations().is_estimated).report(
-        held_out.scene,
-        pictures,
-        histories(),
-        machine(painted.device),
+        held_out.scene, pictures, histories(), machine(painted.device)
     )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
     if pictures.worst:

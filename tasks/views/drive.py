@@ -42,7 +42,7 @@ def write_page(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, 
         WriteError: the file cannot be written.
     """
     from lidarpainter_models.export.page import PageNotes
-    from lidarpainter_models.viewing.recording import Leg, recorded_page
+    from lidarpainter_models.viewing.drive_nodes import Leg, recorded_page
 
     drive = shown_drive(viewed, request, {SHOWN: viewed.fitted})
     trajectory = request.trajectory
@@ -59,10 +59,7 @@ def write_page(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, 
         legs.append(Leg(title=f"{name}, {aside.spec}", trajectory=aside))
     listener().started(STAGE)
     page = recorded_page(
-        drive,
-        legs,
-        notes,
-        progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
+        drive, legs, notes, progress=lambda done, total: listener().advanced(STAGE, done, total, "")
     )
     write_whole(out, page.encode("utf-8"))
     return {"path": str(out), "bytes": len(page), "num_moments": len(drive.path.views)}

@@ -101,10 +101,7 @@ def test_the_frame_of_the_box_decides_and_not_the_world():
     pose = headed(torch.tensor([[3.0, -2.0, 0.5]]).double(), torch.tensor([1.0]).double())[0]
     camera = camera_from(60)
     view = box_view(
-        camera.at(pose @ camera.world_from_camera),
-        torch.zeros(HEIGHT_PX, WIDTH_PX),
-        pose,
-        SIZE_M,
+        camera.at(pose @ camera.world_from_camera), torch.zeros(HEIGHT_PX, WIDTH_PX), pose, SIZE_M
     )
     alone = box_view(camera, torch.zeros(HEIGHT_PX, WIDTH_PX), torch.eye(4), SIZE_M)
     assert torch.equal(view.side, alone.side)

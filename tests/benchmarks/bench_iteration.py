@@ -46,9 +46,7 @@ def street_scene(count, width_px, height_px, *, blocks=1):
         place = torch.tensor([0.0, BLOCK_M * block, 1.0])
         cameras.append(splats["camera"].at(rigid_from_rotation(rotation, place).double()))
         sets.append(_placed(splats, rotation, place))
-    gaussians = GaussianSet(
-        **{name: torch.cat([s[name] for s in sets]) for name in sets[0]},
-    )
+    gaussians = GaussianSet(**{name: torch.cat([s[name] for s in sets]) for name in sets[0]})
     return _scene(gaussians, cameras), cameras
 
 
@@ -141,12 +139,7 @@ def iteration_figures(machine, repeats, *, size=SIZE):
     adam_ms = 1e3 * best_cpu_s(_adam_of(fit), repeats)
     numbers = count * FLOATS_PER_GAUSSIAN
     return [
-        Figure(
-            name="ssim.forward_backward",
-            value=loss_ms,
-            unit="ms",
-            floor=1e3 * ssim_floor,
-        ),
+        Figure(name="ssim.forward_backward", value=loss_ms, unit="ms", floor=1e3 * ssim_floor),
         Figure(
             name="adam.step",
             value=adam_ms,
@@ -162,12 +155,7 @@ def iteration_figures(machine, repeats, *, size=SIZE):
             limit=1.3,
             tolerance=0.15,
         ),
-        Figure(
-            name="iteration.python_share",
-            value=idle_ms / iteration_ms,
-            unit="x",
-            limit=0.05,
-        ),
+        Figure(name="iteration.python_share", value=idle_ms / iteration_ms, unit="x", limit=0.05),
     ]
 
 

@@ -3,22 +3,19 @@
     python tests/benchmarks/bench_one_step.py costs [--preset paper] [--size 1024x576]
     python tests/benchmarks/bench_one_step.py views [--size 512x288] [--rounds 2]
     python tests/benchmarks/bench_one_step.py training [--size 512x288]
-    python tests/benchmarks/bench_one_step.py ablation MODEL --train FOLDER --test FOLDER
 
 `costs` counts parameters, arithmetic and bytes on the meta device; `views` times the painter wired
-plainly, wired well, and with the tiny autoencoder; `training` times a step; `ablation` trains every
-wiring that differs from the model's in one choice. Each measurement has a process of its own.
+plainly, wired well, and with the tiny autoencoder; `training` times a step. Each measurement has a
+process of its own.
 """
 
 import argparse
 import json
 import time
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
-from one_step_ablations import ablation_tables
 from one_step_costs import describe_wiring
 from one_step_training_step import build_training_step
 from one_step_wirings import WIRINGS, build_wiring
@@ -88,29 +85,6 @@ def measure_training(preset, height_px, width_px):
     return {"cpu_s": cpu_s, "wall_s": wall_s, "peak_bytes": peak_bytes, "loss": loss}
 
 
-def ablate(model, train_folders, test_folders, settings):
-    """Train every wiring on the same pairs and judge all alike; pairs are kept in the store."""
-    from catalog.store import open_store
-    from flows.ablate_painter import AblationParameters, ablate_painter
-    from flows.overrides import with_overrides
-    from flows.server import prefect_server
-    from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
-    from lidarpainter_models.painter.training_jobs import recipe_for
-
-    base = AblationParameters(
-        train_folders=train_folders,
-        test_folders=test_folders,
-        base=model,
-        training=recipe_for(model),
-    )
-    base = with_overrides(base, settings)
-    assert isinstance(base.training, OneStepTrainingConfig), f"{model} is no one-step painter"
-    parameters = base.model_copy(update={"tables": ablation_tables(base.training)})
-    store = open_store()
-    with prefect_server(store.root / "logs" / "prefect.log"):
-        return ablate_painter(parameters, store.root)
-
-
 def _padded(height_px, width_px):
     return tuple(-(-size // STRIDE_PX) * STRIDE_PX for size in (height_px, width_px))
 
@@ -119,35 +93,26 @@ def _options():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     kinds = parser.add_subparsers(dest="kind", required=True)
     sizes = {"costs": "1024x576", "views": "512x288", "training": "512x288"}
-    made = {kind: kinds.add_parser(kind) for kind in (*sizes, "ablation")}
+    made = {kind: kinds.add_parser(kind) for kind in sizes}
     for kind, size in sizes.items():
         made[kind].add_argument("--size", default=size, help="WIDTHxHEIGHT of a view")
     made["costs"].add_argument("--preset", choices=PRESETS, default="paper")
     made["views"].add_argument("--rounds", type=int, default=2, help="processes a wiring, in turn")
-    made["ablation"].add_argument("model")
-    made["ablation"].add_argument("--train", type=Path, action="append", required=True)
-    made["ablation"].add_argument("--test", type=Path, action="append", required=True)
-    made["ablation"].add_argument("--set", dest="settings", action="append", default=[])
     return parser.parse_args()
 
 
 def main():
     options = _options()
-    if options.kind == "ablation":
-        found = ablate(
-            options.model, tuple(options.train), tuple(options.test), tuple(options.settings)
-        )
+    width_px, height_px = map(int, options.size.split("x"))
+    if options.kind == "costs":
+        found = describe_wiring(PRESETS[options.preset], height_px=height_px, width_px=width_px)
+    elif options.kind == "views":
+        found = compare_wirings(height_px, width_px, options.rounds)
     else:
-        width_px, height_px = map(int, options.size.split("x"))
-        if options.kind == "costs":
-            found = describe_wiring(PRESETS[options.preset], height_px=height_px, width_px=width_px)
-        elif options.kind == "views":
-            found = compare_wirings(height_px, width_px, options.rounds)
-        else:
-            found = {
-                preset: in_own_process(measure_training, preset, height_px, width_px)
-                for preset in TRAINED_PRESETS
-            }
+        found = {
+            preset: in_own_process(measure_training, preset, height_px, width_px)
+            for preset in TRAINED_PRESETS
+        }
     print(json.dumps(found, indent=1, default=str))  # noqa: T201 - a script
 
 

@@ -110,12 +110,7 @@ def raster_figures(machine, size, repeats):
     forward_floor = sum(floors[name] for name in STAGES[:3])
     backward_floor = sum(floors[name] for name in STAGES[3:])
     return [
-        Figure(
-            name="gaussian_raster.forward",
-            value=forward_ms,
-            unit="ms",
-            floor=forward_floor,
-        ),
+        Figure(name="gaussian_raster.forward", value=forward_ms, unit="ms", floor=forward_floor),
         Figure(
             name="gaussian_raster.backward",
             value=step_ms - forward_ms,

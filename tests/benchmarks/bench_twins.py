@@ -100,12 +100,7 @@ def twin_figures(repeats, *, size=SIZE):
     )
     return [
         Figure(
-            name="iteration.twins",
-            value=twins,
-            unit="ms",
-            floor=numba,
-            backend="torch",
-            limit=MOST,
+            name="iteration.twins", value=twins, unit="ms", floor=numba, backend="torch", limit=MOST
         )
     ]
 

@@ -45,10 +45,7 @@ def cost_of(what: str, run: Callable[[], object], device: torch.device, repeats:
         times_s = [_seconds(run, device) for _ in range(1 + repeats)]
     peak_bytes = torch.cuda.max_memory_allocated(device) if is_gpu else whole.peak_memory_bytes
     return Cost(
-        what=what,
-        first_ms=1e3 * times_s[0],
-        ms=1e3 * median(times_s[1:]),
-        peak_bytes=peak_bytes,
+        what=what, first_ms=1e3 * times_s[0], ms=1e3 * median(times_s[1:]), peak_bytes=peak_bytes
     )
 
 
@@ -201,7 +198,7 @@ def one_step_painter(preset, device, model):
     from turbo_shapes import SD_TURBO
 
     from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-    from lidarpainter_models.painter.one_step.assembly import made_lean
+    from lidarpainter_models.painter.one_step.assembly import merge_lora
     from lidarpainter_models.painter.one_step.config import PRESETS
     from lidarpainter_models.painter.one_step.painter import OneStepPainter
     from lidarpainter_models.painter.one_step.prompts import PromptBook
@@ -214,5 +211,6 @@ def one_step_painter(preset, device, model):
         PRESETS[preset], architecture=architecture, dtype=dtype, has_adapters=True
     )
     text = torch.zeros(TEXT_TOKENS, architecture.text_width, dtype=dtype)
-    painter = OneStepPainter(made_lean(network), PromptBook({DEFAULT_PROMPT: text}), {})
+    merge_lora(network)
+    painter = OneStepPainter(network, PromptBook({DEFAULT_PROMPT: text}), {})
     return painter.to(device), "random weights" if is_gpu else "tiny network"

@@ -17,6 +17,7 @@ from turbo_shapes import SD_TURBO, WholeModel, build_text_encoder
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import (
+    ADAPTER_MARK,
     FIRST_LAYER,
     FUSION,
     SKIPS,
@@ -25,7 +26,6 @@ from lidarpainter_models.painter.one_step.assembly import (
 from lidarpainter_models.painter.one_step.autoencoder import CELL_PX
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.latent_fusion import LATENT_CHANNELS
-from lidarpainter_models.painter.one_step.lora import ADAPTER_MARK
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import STRIDE_PX
 from lidarpainter_models.painter.one_step.prompts import STYLE_TEXTS
@@ -73,11 +73,7 @@ def count_parameters(config: OneStepConfig, architecture: WholeModel = SD_TURBO)
 
 
 def count_tflop(
-    config: OneStepConfig,
-    *,
-    height_px: int,
-    width_px: int,
-    architecture: WholeModel = SD_TURBO,
+    config: OneStepConfig, *, height_px: int, width_px: int, architecture: WholeModel = SD_TURBO
 ) -> dict[str, float]:
     """Arithmetic for one view in 10^12 operations, adapters merged; the text is encoded before.
 
@@ -122,10 +118,7 @@ def count_bytes(config: OneStepConfig, architecture: WholeModel = SD_TURBO) -> d
 def describe_wiring(config: OneStepConfig, *, height_px: int, width_px: int) -> dict[str, Any]:
     """All of it as JSON types."""
     return {
-        "architecture": {
-            "summary": "SD-Turbo in one step, guided by LiDAR",
-            **config.to_dict(),
-        },
+        "architecture": {"summary": "SD-Turbo in one step, guided by LiDAR", **config.to_dict()},
         "parameters": count_parameters(config),
         "size_px": [width_px, height_px],
         "tflop": count_tflop(config, height_px=height_px, width_px=width_px),

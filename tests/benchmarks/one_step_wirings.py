@@ -2,9 +2,9 @@
 
 `plain` is the paper's network as one would first write it: two encodings, adapters beside their
 layers, the text encoder run for every view, weights built in float32 and then rounded. `lean` is
-how `OneStepPainter` runs: one batch through the encoder, adapters merged, doublings by phases
-(`upsampling.py`), the text encoded before, channels last, weights built in bfloat16. `taesd` is
-`lean` with the tiny autoencoder. All three have the same random weights.
+how `OneStepPainter` runs: one batch through the encoder, adapters merged, the text encoded
+before, channels last, weights built in bfloat16. `taesd` is `lean` with the tiny autoencoder. All
+three have the same random weights.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from turbo_shapes import SD_TURBO, WholeModel, build_text_encoder
 
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.assembly import made_lean
+from lidarpainter_models.painter.one_step.assembly import merge_lora
 from lidarpainter_models.painter.one_step.config import FAST, PAPER
 from lidarpainter_models.painter.one_step.prompts import run_text_encoder
 
@@ -37,9 +37,8 @@ def build_wiring(wiring: Wiring, architecture: WholeModel = SD_TURBO) -> Paint:
         return _plain(architecture)
     # the tiny autoencoder has no adapters; time and fusion are those of `paper` in all three
     config = PAPER if wiring == "lean" else replace(FAST, timestep=PAPER.timestep)
-    network = made_lean(
-        random_network(config, architecture=architecture, seed=_SEED, has_adapters=True)
-    )
+    network = random_network(config, architecture=architecture, seed=_SEED, has_adapters=True)
+    merge_lora(network)
     # torch's stub lacks memory_format
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     text = _text(_text_encoder(architecture, torch.bfloat16))

@@ -8,20 +8,14 @@ from torch import nn
 from turbo_shapes import SD_TURBO
 
 from lidarpainter_models.painter.one_step.architectures import build_tiny, build_unet, build_vae
-from lidarpainter_models.painter.one_step.assembly import assemble
-from lidarpainter_models.painter.one_step.lora import ADAPTER_MARK
+from lidarpainter_models.painter.one_step.assembly import ADAPTER_MARK, assemble
 
 _POOL = 1 << 20
 """Random numbers that are drawn; larger weights repeat them."""
 
 
 def random_network(
-    config,
-    *,
-    architecture=SD_TURBO,
-    dtype=torch.bfloat16,
-    seed=0,
-    has_adapters=False,
+    config, *, architecture=SD_TURBO, dtype=torch.bfloat16, seed=0, has_adapters=False
 ):
     """A network of the true size whose weights follow from the seed, for measuring and testing.
 

@@ -6,13 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from chromium import found_browser
 from written_logs import WRITERS
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-TWO_COLOURS = """<canvas width=9 height=9></canvas><script>
-document.querySelector('canvas').getContext('2d').fillRect(0, 0, 4, 9)</script>"""
 
 
 def run(name, *words):
@@ -36,14 +33,9 @@ def slow(*case):
 @pytest.mark.parametrize(
     ("name", "words", "told"),
     [
-        ("bench_catalog.py", ("60",), "60"),
-        ("bench_fleet.py", ("2",), "2 sequences:"),
-        ("bench_nuscenes_tables.py", ("--rows", "1000"), "1,000"),
-        ("bench_questions.py", ("5",), "5 scenes, 35 artefacts"),
         ("bench_serving.py", ("--quick",), "fisheye of 190 degrees:"),
         ("bench_one_step.py", ("costs", "--size", "64x64"), "{"),
         slow("bench_length.py", ("--quick",), "... over"),
-        slow("bench_waymo_reader.py", ("--frames", "1"), "v2:"),
     ],
 )
 def test_a_benchmark_that_makes_its_own_input_tells_figures(name, words, told):
@@ -54,15 +46,6 @@ def test_ingest_is_timed_and_its_digests_are_one(tmp_path):
     log = WRITERS["pandaset"](tmp_path)
     words = ("--dataset", log.dataset, "--sequence", log.sequence, "--runs", "2")
     assert run("bench_ingest.py", log.root, *words).count("frames/s") == 2
-
-
-@pytest.mark.slow
-def test_pages_and_galleries_are_timed_in_a_browser(tmp_path):
-    found_browser()
-    page = tmp_path / "page.html"
-    page.write_text(TWO_COLOURS, "utf-8")
-    assert "first image after" in run("bench_page.py", page, "1")
-    assert "a filter in" in run("bench_gallery.py", "20", "1")
 
 
 @pytest.mark.slow

@@ -73,16 +73,6 @@ def names_left(root: Path) -> list[str]:
     return [path.name for path in root.glob("aside/*")] + [p.name for p in root.glob("work/*")]
 
 
-def test_what_was_made_once_is_not_made_again(tmp_path):
-    store = ArtefactStore(tmp_path)
-    first, computed_first = store.produce(recipe_of(), write_one)
-    second, computed_second = store.produce(recipe_of(), pytest.fail)
-    assert (computed_first, computed_second) == (True, False)
-    assert first == second
-    assert (store.folder(second) / "deep" / "more.bin").read_bytes() == b"678"
-    assert names_left(tmp_path) == []
-
-
 def test_manifest_tells_what_was_made_from_what(tmp_path):
     store = ArtefactStore(tmp_path)
     ref, _ = store.produce(recipe_of(), write_one)

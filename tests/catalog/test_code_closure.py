@@ -182,11 +182,7 @@ def test_functions_and_objects_bound_to_a_build_count(toy, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        (
-            "stage.py",
-            "from toy.gone import x\ndef build(): x\n",
-            "toy.gone, which has no source",
-        ),
+        ("stage.py", "from toy.gone import x\ndef build(): x\n", "toy.gone, which has no source"),
         (
             "stage.py",
             "from toy.numbers import gone\ndef build(): gone\n",

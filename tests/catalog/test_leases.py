@@ -10,22 +10,6 @@ from catalog.errors import CatalogError
 from catalog.leases import FolderObjects, LeaseLostError, Leases
 
 ROOT = Path(__file__).resolve().parents[2]
-COUNTER = """
-import sys, time
-from pathlib import Path
-from catalog.leases import FolderObjects, Leases
-folder = Path(sys.argv[1])
-leases = Leases(FolderObjects(folder / "leases"))
-for name in ("a", "b", "c"):
-    for _ in range(10):
-        while (lease := leases.take(name, above=0, facts={})) is None:
-            time.sleep(0.001)
-        count = folder / name
-        before = int(count.read_text()) if count.exists() else 0
-        lease = leases.renew(lease, {})
-        count.write_text(str(before + 1))
-        assert leases.give_back(lease)
-"""
 TAKER = """
 import sys
 from pathlib import Path
@@ -63,15 +47,6 @@ def clock():
 @pytest.fixture
 def leases(tmp_path, clock):
     return Leases(FolderObjects(tmp_path), time_to_live_s=60.0, now=clock)
-
-
-def test_what_is_in_hand_cannot_be_taken(leases):
-    lease = leases.take("a", above=3, facts={"scene_id": "x/y"})
-    assert lease.fence == 4
-    assert leases.take("a", above=9, facts={}) is None
-    assert [(one.name, one.facts) for one in leases.held()] == [("a", {"scene_id": "x/y"})]
-    assert leases.give_back(lease)
-    assert leases.take("a", above=4, facts={}).fence == 5
 
 
 def test_a_lease_lives_by_its_heartbeat(leases, clock):
@@ -113,14 +88,6 @@ def test_a_damaged_lease_is_told_in_one_line(leases, tmp_path, content):
     (tmp_path / "a").write_bytes(content)
     with pytest.raises(CatalogError, match="the lease a is damaged"):
         leases.held()
-
-
-def test_eight_processes_count_and_none_is_lost(tmp_path):
-    counters = [
-        subprocess.Popen([sys.executable, "-c", COUNTER, str(tmp_path)], cwd=ROOT) for _ in range(8)
-    ]
-    assert [counter.wait(timeout=120) for counter in counters] == [0] * 8
-    assert [(tmp_path / name).read_text() for name in "abc"] == ["80"] * 3
 
 
 def test_who_waits_for_a_lease_is_alone_with_it(tmp_path):

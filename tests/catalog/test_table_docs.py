@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 from catalog.schemas import ARROW_TYPES, TABLES
-from catalog.table_docs import tables_page
+from catalog.sql import tables_page
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 

@@ -14,16 +14,6 @@ from catalog.schemas import TABLES
 from catalog.tables import MOST_FILES, CatalogTables
 
 ROOT = Path(__file__).resolve().parents[2]
-WRITER = """
-import sys
-from catalog.tables import CatalogTables
-tables, writer = CatalogTables(sys.argv[1]), sys.argv[2]
-for number in range(4):
-    tables.merge("metrics", [
-        {"metric_id": f"{writer}-{number}", "name": "psnr", "value": float(number)},
-        {"metric_id": "shared", "name": "psnr", "value": 1.0},
-    ])
-"""
 READER = """
 import sys
 from catalog.tables import CatalogTables
@@ -110,17 +100,6 @@ def test_rows_are_found_by_some_of_their_values_in_whichever_file_they_lie(table
     assert found["num_bytes"].to_pylist() == [None] * 3
     assert tables.arrow("painters", where={"name": []}).num_rows == 0
     assert tables.arrow("runs", where={"run_id": ["a"]}).num_rows == 0
-
-
-def test_four_processes_at_once_lose_nothing(tables):
-    writers = [
-        subprocess.Popen([sys.executable, "-c", WRITER, tables.root, str(index)], cwd=ROOT)
-        for index in range(4)
-    ]
-    assert [writer.wait(timeout=60) for writer in writers] == [0] * 4
-    ids = [row["metric_id"] for row in tables.rows("metrics")]
-    expected = sorted([f"{writer}-{number}" for writer in range(4) for number in range(4)])
-    assert ids == [*expected, "shared"]
 
 
 def test_a_process_that_ends_right_after_a_read_ends_well(tables):

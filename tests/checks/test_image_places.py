@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from lidarpainter_models.checks.calibration import check_image_places
 from lidarpainter_models.checks.depth_edges import SceneEdges
-from lidarpainter_models.checks.image_places import check_image_places
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS

@@ -11,8 +11,7 @@ from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.actors import check_box_points
 from lidarpainter_models.checks.doctor import check_scene
-from lidarpainter_models.checks.lidar_reach import LidarReach
-from lidarpainter_models.checks.sweeps import check_coverage
+from lidarpainter_models.checks.sweeps import LidarReach, check_coverage
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene

@@ -58,12 +58,9 @@ def test_conditions_hold_render_lidar_and_references(builder, camera_at, board, 
     assert found.render_rgb.max() <= 1
 
 
-def test_an_excluded_view_is_no_source(builder, views, camera_at):
-    camera = camera_at(0.8)
-    nearest = builder.sources_for(camera, views[2].timestamp_ns)
-    others = builder.sources_for(camera, views[2].timestamp_ns, exclude=frozenset({views[2].key}))
+def test_every_view_is_a_source_once_and_the_nearest_comes_first(builder, views, camera_at):
+    nearest = builder.sources_for(camera_at(0.8), views[2].timestamp_ns)
     assert nearest[0].key == views[2].key
-    assert views[2].key not in [source.key for source in others]
     assert len({source.key for source in nearest}) == len(nearest) == NUM_VIEWS
 
 
@@ -80,11 +77,6 @@ def test_sources_that_there_is_no_room_for_are_rendered_again(
     assert builder.source(views[2].key) is kept
     builder.source(views[1].key)
     assert builder.source(views[2].key) is not kept
-
-
-def test_with_every_view_excluded_no_reference_is_valid(builder, views, camera_at):
-    found = builder.conditions(camera_at(), 0, exclude=frozenset(view.key for view in views))
-    assert not found.warp_valid.any()
 
 
 def test_references_have_the_exposure_asked_for(scene, lidar_map, views, camera_at):

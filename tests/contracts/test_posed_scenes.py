@@ -14,13 +14,8 @@ import torch
 from gaussian_world import FRAME_NS, camera_at
 from styled_world import clear_scene, styled
 
-from lidarpainter_models.export.contents import scene_contents
-from lidarpainter_models.export.fidelity import world_image
-from lidarpainter_models.gaussians.fitting.config import (
-    FitConfig,
-    FitLossWeights,
-    GuidanceConfig,
-)
+from lidarpainter_models.export.contents import scene_contents, world_image
+from lidarpainter_models.gaussians.fitting.config import FitConfig, FitLossWeights, GuidanceConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.lamp_images import Look, lacking
 from lidarpainter_models.gaussians.fitting.state import FitState
@@ -31,7 +26,7 @@ from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, ins
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.kernels.pixel_losses import SOLID
 from lidarpainter_models.observations.views import GuidanceView
-from lidarpainter_models.viewing.browser_splats import recorded_rgb
+from lidarpainter_models.viewing.scene_nodes import recorded_rgb
 
 ROOT = Path(__file__).parents[2]
 CAR = 1
@@ -105,9 +100,7 @@ def test_a_fit_shows_the_image_on_recorded_and_on_painted_views(image):
         return rendered.sum() * 0
 
     config = FitConfig(
-        steps=4,
-        losses=FitLossWeights(perceptual=1.0),
-        guidance=GuidanceConfig(perceptual=1.0),
+        steps=4, losses=FitLossWeights(perceptual=1.0), guidance=GuidanceConfig(perceptual=1.0)
     )
     beside = replace(camera, shutter=None)
     painted = GuidanceView.of(

@@ -6,11 +6,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import torch
+from confidence_trials import FARTHEST
 from gaussian_world import map_points
 from toy_street import ToyStreet
 
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer, ViewEvidence
-from lidarpainter_models.evaluation.confidence_trials import FARTHEST
 from lidarpainter_models.evaluation.envelope import (
     DIRECTIONS,
     MovedViews,

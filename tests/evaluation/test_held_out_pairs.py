@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.evaluation.held_back import target_view
+from lidarpainter_models.evaluation.held_back import held_out_pairs, target_view, unseen_views
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.held_out_pairs import held_out_pairs, unseen_views
 from lidarpainter_models.evaluation.view_scores import ScoredView
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift

@@ -7,11 +7,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.evaluation.painting import (
-    confidence_auc,
-    outside_hull,
-    score_painter,
-)
+from lidarpainter_models.evaluation.painting import confidence_auc, outside_hull, score_painter
 from lidarpainter_models.painter.baselines import UnpaintedPainter
 from lidarpainter_models.painter.protocol import Painting
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from confidence_trials import trials, true_psnr_db
 from tiny_street import FRONT, tiny_street
 
 import lidarpainter_models as lp
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
-from lidarpainter_models.evaluation.confidence_trials import trials, true_psnr_db
 from lidarpainter_models.evaluation.envelope import DIRECTIONS, MovedViews, trust_envelope
 from lidarpainter_models.evaluation.view_confidence import BUNDLED, GOOD_DB
 from lidarpainter_models.synthetic import RigLidar

@@ -7,7 +7,7 @@ import torch
 from gaussian_world import FRAME_NS, build_world, camera_at
 
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
-from lidarpainter_models.evaluation.round_gain import _halfway, round_gain
+from lidarpainter_models.evaluation.scene_evaluation import _halfway, round_gain
 from lidarpainter_models.observations.views import GuidanceView
 
 
@@ -43,9 +43,7 @@ def test_sharper_training_views_alone_are_no_gain(world, monkeypatch):
     measured = EvidenceGatherer.of
     closer = iter([20.0, 40.0])  # dB on training views, before and after
     monkeypatch.setattr(
-        EvidenceGatherer,
-        "of",
-        lambda *words: replace(measured(*words), recorded_db=next(closer)),
+        EvidenceGatherer, "of", lambda *words: replace(measured(*words), recorded_db=next(closer))
     )
     views = [painted(camera_at(0.4))]
     gain = round_gain(world.scene, world.scene, world.observations, views)

@@ -4,15 +4,10 @@ import math
 
 import pytest
 import torch
+from confidence_fit import calibrated, expected_calibration_error
 
 from lidarpainter_models.conditioning.view_evidence import ViewEvidence
-from lidarpainter_models.evaluation.view_confidence import (
-    BUNDLED,
-    GOOD_DB,
-    Calibration,
-    calibrated,
-    expected_calibration_error,
-)
+from lidarpainter_models.evaluation.view_confidence import BUNDLED, GOOD_DB, Calibration
 
 NAMES = ("expected_db", "support")
 FULL = dict.fromkeys(ViewEvidence.__dataclass_fields__, 1.0)

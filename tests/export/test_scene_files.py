@@ -22,8 +22,7 @@ from lidarpainter_models.errors import (
     WriteError,
 )
 from lidarpainter_models.export import gltf_files
-from lidarpainter_models.export.contents import scene_contents
-from lidarpainter_models.export.fidelity import fidelity, world_image
+from lidarpainter_models.export.contents import fidelity, scene_contents, world_image
 from lidarpainter_models.export.gltf_files import EXTENSION, write_gltf
 from lidarpainter_models.export.spz_files import SPZ_FROM_WORLD, read_spz, write_spz
 from lidarpainter_models.export.usd_files import TIME_CODES_PER_SECOND, write_usd

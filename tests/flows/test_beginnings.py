@@ -154,10 +154,7 @@ def test_words_that_begin_are_shown_on_a_terminal_alone(store):
 
 @pytest.mark.parametrize(
     "encoding",
-    [
-        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-        {"PYTHONIOENCODING": "ascii"},
-    ],
+    [{"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, {"PYTHONIOENCODING": "ascii"}],
     ids=["C locale", "ASCII stdout"],
 )
 def test_a_path_beyond_ascii_is_read_and_told_whatever_the_locale_is(encoding, tmp_path):

@@ -37,7 +37,7 @@ def derive(own_run):
         return derive_run(store, run, change, build=build)
 
     with pytest.MonkeyPatch.context() as patched:
-        from tasks import source as sources
+        from tasks import stages as sources
 
         known = sources.project_source()
         there = known.code_from(("tasks.stored:save_scene",))

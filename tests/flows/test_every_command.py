@@ -10,16 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refuse, seen_image, succeed
-from tiny_street import (
-    FRONT,
-    HEIGHT_PX,
-    NUM_FRAMES,
-    SCENE,
-    SIDE,
-    TINY,
-    WIDTH_PX,
-    reconstructed,
-)
+from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SIDE, TINY, WIDTH_PX, reconstructed
 
 from flows.cli.evaluate import NEURAD, PROTOCOLS
 from lidarpainter_models.export.images import read_image

@@ -15,14 +15,7 @@ from tasks.progress import listener
 
 @pytest.mark.parametrize(
     ("value", "expected"),
-    [
-        (None, "-"),
-        (True, "yes"),
-        (29.53449, "29.534"),
-        (7, "7"),
-        ("a[bold]", "a[bold]"),
-        ("", "-"),
-    ],
+    [(None, "-"), (True, "yes"), (29.53449, "29.534"), (7, "7"), ("a[bold]", "a[bold]"), ("", "-")],
 )
 def test_cells_are_short_and_never_markup(value, expected):
     assert format_cell(value) == expected

@@ -7,9 +7,8 @@ import sys
 import pytest
 from commands import refuse, succeed
 
-from flows.overrides import with_overrides
+from flows.overrides import known_settings, with_overrides
 from flows.presets import PRESETS, preset
-from flows.setting_lists import known_settings
 
 
 @pytest.mark.parametrize("name", PRESETS)

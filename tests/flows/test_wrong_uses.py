@@ -76,13 +76,9 @@ def refused(words, expected, place):
         # ingest
         (("ingest", "lyft", "{root}"), "'lyft' is not known, expected one of pandaset, nuscenes"),
         (("ingest", "pandaset", "{tmp}/gone"), "no such folder, expected the root of pandaset"),
-        (("ingest", "pandaset", "{file}"), "no such folder, expected the root of pandaset"),
         (("ingest", "nuscenes", "{tmp}/empty"), "no nuscenes sequence found"),
         (("ingest", "pandaset", "{root}", "7"), "no such sequence folder"),
-        (
-            ("ingest", "pandaset", "{root}", "../x"),
-            "'pandaset/../x' is no scene id",
-        ),
+        (("ingest", "pandaset", "{root}", "../x"), "'pandaset/../x' is no scene id"),
         (("ingest", "pandaset", "{root}/{sequence}"), "use its parent {root}, which holds"),
         (
             ("ingest", "pandaset", "{root}/{sequence}", "{sequence}"),
@@ -101,7 +97,6 @@ def refused(words, expected, place):
         (("ingest", "pandaset", "{root}", "--frames", "900:901"), "select none of its"),
         # reconstruct
         (("reconstruct", "nonsense"), "is no scene id, expected dataset/sequence such as"),
-        (("reconstruct", "../../etc"), "is no scene id, expected dataset/sequence such as"),
         (("reconstruct", "toy/other"), "ingest it first (there is toy/street)"),
         (
             (*TOY, "--preset", "fast"),
@@ -110,7 +105,6 @@ def refused(words, expected, place):
         ((*TOY, "--painter", "miro"), "no painter 'miro': expected one of none, overlay, warp"),
         ((*TOY, "--painter", "{tmp}/gone.safetensors"), "no painter weights at"),
         ((*TOY, "--painter", "{garbage}"), "{garbage}"),
-        ((*TOY, "--painter", "{file}"), "expected one of none, overlay, warp"),
         ((*TOY, "--painter", "{tmp}"), "expected a diffusers folder"),
         ((*TOY, "--device", "tpu"), "no device 'tpu', expected auto, cpu, cuda or cuda:N"),
         ((*TOY, "--memory", "6"), "--memory '6': expected a size such as 6GB, in MB, GB"),
@@ -124,8 +118,6 @@ def refused(words, expected, place):
         ((*TOY, "--train-cameras", "roof"), "no camera 'roof'; it has front"),
         ((*TOY, "--shift", "200"), "at most 8 metres from the recorded path"),
         ((*TOY, "--shift", "-2"), "expected positive metres with commas between, such as 2,3"),
-        ((*TOY, "--up", "20"), "at most 8 metres from the recorded path"),
-        ((*TOY, "--up", "x"), "expected positive metres"),
         ((*TOY, "--config", "absent.toml"), "no manifest absent.toml"),
         ((*TOY, "--set", "fit.shapes.most_sigma=1"), "no setting 'fit.shapes.most_sigma'"),
         ((*TOY, "--set", "fit.steps"), "expected a setting as key=value"),
@@ -147,7 +139,6 @@ def refused(words, expected, place):
         ((*RENDER, "recorded", "--previous", "mixed,shown"), "expected one of them here"),
         ((*RENDER, "recorded", "--previous", "next"), "--previous 'next': expected unused, mixed"),
         (("render", "ffff", "--trajectory", "recorded", "--out", "x"), "no run_id 'ffff' among 0"),
-        (("stylize", "latest", "--prompt", "rain", "--out", "x"), "no complete run in {store}"),
         (("stylize", "latest", "--prompt", "rain", "--out", "x", "--seed", "-1"), "'--seed'"),
         (("stylize", "latest", "--prompt", "foggy:2", "--in-scene"), "from 0 to 1, got 2"),
         (("stylize", "latest", "--prompt", "foggy", "--visibility", "0", "--out", "x"), "above 0"),
@@ -157,13 +148,7 @@ def refused(words, expected, place):
         ),
         (("stylize", "latest", "--prompt", "rain"), "--out FOLDER"),
         ((*IN_SCENE, "--trajectory", "up:1"), "--in-scene has no use for --trajectory"),
-        ((*IN_SCENE, "--images", "recorded"), "--in-scene has no use for --images"),
-        ((*IN_SCENE, "--camera", "front"), "--in-scene has no use for --camera"),
-        ((*IN_SCENE, "--frames", "0:2"), "--in-scene has no use for --frames"),
-        ((*IN_SCENE, "--width", "90"), "--in-scene has no use for --width"),
-        ((*IN_SCENE, "--painter", "warp"), "--in-scene has no use for --painter"),
         ((*IN_SCENE, "--allow-collisions"), "--in-scene has no use for --allow-collisions"),
-        (("evaluate", "latest"), "no complete run in {store}"),
         (("evaluate", "latest", "--protocol", "guess"), "expected paper, truth, neurad"),
         (("evaluate", "latest", "--previous", "mixed"), "is judged by --protocol flicker"),
         (
@@ -175,8 +160,6 @@ def refused(words, expected, place):
             "--protocol cross-camera has no use for --feature-weights",
         ),
         # painters
-        (("painter", "info", "--painter", "miro"), "expected one of none, overlay, warp"),
-        (("painter", "info", "--painter", "{garbage}"), "{garbage}"),
         (("painter", "benchmark", "--size", "0x3"), "expected such as 1024x576"),
         (("painter", "evaluate", "--painter", "nano"), "expected --pairs or --run"),
         (("painter", "evaluate", "--painter", "a,a", "--run", "latest"), "expected each once"),
@@ -194,13 +177,8 @@ def refused(words, expected, place):
         (("painter", "train", "--seeds", "1"), "painters train on seeds from 1000 up"),
         (("painter", "train", "--seeds", "1000", "--steps", "-1"), "steps must be positive"),
         (("painter", "train", "--seeds", "1000", "--budget", "0"), "positive"),
-        (
-            ("painter", "train", "--seeds", "1000", "--held-back", "2"),
-            "held_back: Input should",
-        ),
-        (("painter", "train", "--seeds", "1000", "--inputs", "smell"), "smell"),
+        (("painter", "train", "--seeds", "1000", "--held-back", "2"), "held_back: Input should"),
         (("painter", "train", "--seeds", "1000", "--prompts", "clear,snow"), "snow"),
-        (("painter", "train", "--scene", "toy/other"), "ingest it first"),
         (("painter", "train", "--seeds", "1000", "--start", "{garbage}"), "{garbage}"),
         (("painter", "train", "--seeds", "1000", "--base", "{tmp}/gone"), "has no weights for it"),
         (
@@ -216,7 +194,6 @@ def refused(words, expected, place):
         (("catalog", "show", "nothing"), "nothing is called 'nothing'"),
         (("catalog", "show", ""), "expected an id or the beginning of one"),
         (("catalog", "show", "latest"), "no complete run in {store}"),
-        (("catalog", "explain", "nothing"), "nothing is called 'nothing'"),
         (("catalog", "explain", TOY_SCENE), "no complete run of toy/street in {store}"),
         (("render", TOY_SCENE, *RENDER[2:], "recorded"), "no complete run of toy/street in"),
         (
@@ -228,11 +205,7 @@ def refused(words, expected, place):
         (("catalog", "delete", "../..", "--yes"), "nothing is called '../..'"),
         (("catalog", "delete", TOY_SCENE), "nobody can be asked whether to delete this"),
         # doctor
-        (("doctor", "nonsense"), "is no scene id, expected dataset/sequence such as"),
         (("doctor", "toy/other"), "ingest it first"),
-        (("doctor", "lyft", "{root}"), "'lyft' is not known, expected one of"),
-        (("doctor", "pandaset", "{tmp}/gone"), "no such folder, expected the root of pandaset"),
-        (("doctor", "pandaset", "{root}/{sequence}"), "use its parent {root}"),
         (("doctor", TOY_SCENE, "--out", "{file}/x.png"), "cannot write {file}/x.png"),
         # the store
         (("--store", "{file}", "catalog", "list"), "is a file, expected a folder"),
@@ -241,10 +214,7 @@ def refused(words, expected, place):
             ("--store", "{file}/x", "ingest", "pandaset", "{root}"),
             "a part of the path is not a folder",
         ),
-        (
-            ("--store", "/proc/x", "ingest", "pandaset", "{root}"),
-            "/proc/x cannot be written",
-        ),
+        (("--store", "/proc/x", "ingest", "pandaset", "{root}"), "/proc/x cannot be written"),
         (("demo", "--out", "{file}"), "the store {file}/store cannot be written: Not a directory"),
     ],
 )

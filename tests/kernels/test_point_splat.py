@@ -97,16 +97,6 @@ def test_the_number_of_threads_changes_nothing():
     assert torch.equal(*images)
 
 
-def test_strided_and_float64_points_are_taken_as_they_are():
-    inputs = random_splat(300, seed=5)
-    strided = inputs | {
-        "pixels_uv": inputs["pixels_uv"].T.contiguous().T,
-        "depth_m": inputs["depth_m"].double(),
-        "radius_px": inputs["radius_px"].int(),
-    }
-    assert torch.equal(splat_points(**strided), splat_points(**inputs))
-
-
 def test_points_that_do_not_fit_together_are_refused():
     with pytest.raises(ShapeError, match="one depth per point"):
         splat_points(torch.zeros(3, 2, dtype=torch.int64), torch.ones(2), height_px=2, width_px=2)

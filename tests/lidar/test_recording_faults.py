@@ -11,12 +11,7 @@ from toy_street import ToyStreet
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar import recording_faults
 from lidarpainter_models.lidar.hub_images import ContrastImage
-from lidarpainter_models.lidar.recording_faults import (
-    Found,
-    believed,
-    cannot_be_told,
-    find_faults,
-)
+from lidarpainter_models.lidar.recording_faults import Found, believed, cannot_be_told, find_faults
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street

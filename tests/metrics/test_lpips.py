@@ -7,11 +7,15 @@ import torch
 
 from lidarpainter_models.errors import ShapeError, WeightsError
 from lidarpainter_models.metrics import lpips as lpips_module
-from lidarpainter_models.metrics.backbones import BACKBONES, SQUEEZENET, load_stack
+from lidarpainter_models.metrics.backbones import (
+    BACKBONES,
+    SQUEEZENET,
+    load_squeezenet_distance,
+    load_stack,
+)
 from lidarpainter_models.metrics.lpips import HEAD_KEY, Lpips, load_lpips, read_heads
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.metrics.perceptual import load_distances
-from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 
 PARAMETERS = {"VGG-16": 14_714_688, "AlexNet": 2_469_696, "SqueezeNet 1.1": 722_496}
 """Of the features alone: what is left of the published counts without the classifiers."""
@@ -180,7 +184,7 @@ def test_negative_heads_are_refused(tmp_path):
 def test_the_backbone_of_lpips_never_passes_for_the_caffe_features(tmp_path, monkeypatch):
     files = write_files(tmp_path, SQUEEZENET)
     monkeypatch.setattr(
-        "lidarpainter_models.metrics.squeezenet.is_published", lambda _path, _backbone: True
+        "lidarpainter_models.metrics.backbones.is_published", lambda _path, _backbone: True
     )
     with pytest.raises(WeightsError, match=r"is torchvision's SqueezeNet 1\.1"):
         load_squeezenet_distance(files.backbone)

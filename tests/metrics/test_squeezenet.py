@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.metrics.backbones import squeezenet_stack
-from lidarpainter_models.metrics.squeezenet import (
+from lidarpainter_models.metrics.backbones import (
     SqueezeNetDistance,
     load_squeezenet_distance,
+    squeezenet_stack,
 )
 
 

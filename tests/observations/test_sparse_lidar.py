@@ -11,16 +11,16 @@ from wall_drive import WALL_X_M, WallDrive
 
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import gather_points
-from lidarpainter_models.observations import sparse_lidar
-from lidarpainter_models.observations.preparation import prepare_observations
-from lidarpainter_models.observations.settings import ObservationConfig
-from lidarpainter_models.observations.sparse_lidar import (
+from lidarpainter_models.observations import preparation
+from lidarpainter_models.observations.preparation import (
     CELL_RAD,
     LEAST_ON_ACTOR,
     LEAST_TOLD,
     completed,
+    prepare_observations,
     share_told,
 )
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.records import SweepPoints
 from lidarpainter_models.scenes.splits import split_views
 
@@ -169,7 +169,7 @@ def test_of_many_points_no_more_are_looked_at_than_allowed(monkeypatch):
     by_turns = torch.arange(2 * len(line)).view(2, -1).T.flatten()
     street = MapPoints.concatenate([behind, line]).keep(by_turns)
     assert share_told(street, views, {}) > 0
-    monkeypatch.setattr(sparse_lidar, "_MOST_POINTS", len(street) - 1)
+    monkeypatch.setattr(preparation, "_MOST_POINTS", len(street) - 1)
     assert share_told(street, views, {}) == 0  # of each two the first, which is behind
 
 

@@ -121,12 +121,7 @@ def test_unknown_pixels_reach_neither_lpips_nor_discriminator():
     torch.manual_seed(0)
     judge = PatchDiscriminator(DiscriminatorConfig(width=4, num_layers=1, num_scales=1))
     paper_loss(
-        image,
-        target,
-        mask,
-        PaperLossWeights(),
-        lpips=tenfold_difference,
-        discriminator=judge,
+        image, target, mask, PaperLossWeights(), lpips=tenfold_difference, discriminator=judge
     )["total"].backward()
     assert float(image.grad[:, :, 8:].abs().max()) == 0
     assert float(image.grad[:, :, :8].abs().max()) > 0

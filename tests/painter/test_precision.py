@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lidarpainter_models.painter import precision
+from lidarpainter_models.painter.description import time_views
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.speed import time_views
 
 CPU = torch.device("cpu")
 
@@ -59,8 +59,7 @@ print(times_s[chosen] / times_s[torch.float32])
 
 
 @pytest.mark.parametrize(
-    "held_to",
-    [{}, {"ATEN_CPU_CAPABILITY": "avx2"}, {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE"}],
+    "held_to", [{}, {"ATEN_CPU_CAPABILITY": "avx2"}, {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE"}]
 )
 def test_the_choice_is_never_slower_than_float32(held_to, monkeypatch):
     for name, value in held_to.items():

@@ -13,19 +13,11 @@ from small_pandaset import PandasetFolder
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import is_inside_box
-from lidarpainter_models.readers import ingest_scene, list_sequences
+from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
 from lidarpainter_models.readers.source_logs.log import read_ahead
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.stored import stored_digest
-
-
-def test_world_begins_at_the_first_ego_pose_and_looks_along_the_road(small_scene):
-    expected = torch.eye(4, dtype=torch.float64)
-    assert torch.allclose(small_scene.world_from_ego[0], expected, atol=1e-9)
-    travelled = small_scene.world_from_ego[:, :3, 3]
-    assert torch.allclose(travelled[:, 0], torch.tensor([0.0, 1.0, 2.0]).double(), atol=1e-6)
-    assert travelled[:, 1:].abs().max() < 1e-6
 
 
 def test_cameras_look_where_they_are_mounted(small_scene):
@@ -148,14 +140,6 @@ def test_error_in_a_frame_is_raised_when_the_frame_is_due():
         assert next(frames) == 0
         with pytest.raises(DataError, match="frame 1"):
             next(frames)
-
-
-def test_sequences_are_listed(sound_pandaset, tmp_path):
-    assert list_sequences("pandaset", sound_pandaset.root) == ("002",)
-    with pytest.raises(DataError, match="no pandaset sequence"):
-        list_sequences("pandaset", tmp_path)
-    with pytest.raises(DataError, match="'lyft' is not known, expected one of pandaset"):
-        list_sequences("lyft", tmp_path)
 
 
 def test_actor_seen_by_the_forward_lidar_alone_keeps_its_track(pandaset, tmp_path):

@@ -10,12 +10,7 @@ from scene_differences import scene_differences
 from lidarpainter_models.checks.doctor import check_scene
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
 
 YAW_RAD = dict(zip(CAMERA_NAMES, np.radians([0, 57, -57, 90, -90, 180]).tolist(), strict=True))
 

@@ -5,11 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.scenes.lone_returns import (
-    WEATHER_REACH_M,
-    is_confirmed,
-    stands_alone,
-)
+from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed, stands_alone
 
 HEIGHT_M = 2.0
 

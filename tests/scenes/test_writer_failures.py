@@ -4,11 +4,7 @@ import errno
 import fcntl
 
 import pytest
-from scene_parts import (
-    HEADER,
-    add_frame,
-    files_below,
-)
+from scene_parts import HEADER, add_frame, files_below
 
 from lidarpainter_models.errors import WriteError
 from lidarpainter_models.scenes import array_writer, schema

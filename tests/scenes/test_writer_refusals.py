@@ -199,10 +199,7 @@ def test_bad_input_is_one_line_with_its_place_and_leaves_nothing(tmp_path, thing
         writer.add_frame(0, timestamp_ns=0, world_from_ego=IDENTITY)
         BAD_THINGS[thing](writer)
 
-    with (
-        pytest.raises(DataError) as raised,
-        SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
-    ):
+    with pytest.raises(DataError) as raised, SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
         write(writer)
     assert "\n" not in str(raised.value)
     assert "frame" in str(raised.value) or "name" in str(raised.value)

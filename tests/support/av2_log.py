@@ -23,12 +23,7 @@ from lidarpainter_models.geometry.transforms import (
 )
 from lidarpainter_models.readers.source_logs.drive_poses import poses_at
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
 
 LOG = "00a6ffc1-6ce9-3bc3-a060-6006e9893a1a"
 CAMERAS = (

@@ -21,12 +21,7 @@ import numpy as np
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-WORDS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--hide-scrollbars",
-    "--remote-debugging-port=0",
-)
+WORDS = ("--headless=new", "--no-sandbox", "--hide-scrollbars", "--remote-debugging-port=0")
 SOFTWARE_WEBGL = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
 NO_WEBGL = ("--disable-3d-apis",)
 CANVAS = "[...document.querySelectorAll('canvas')].sort((a, b) => b.width - a.width)[0]"

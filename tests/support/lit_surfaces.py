@@ -42,10 +42,7 @@ def random_scene(count, lamps=7, seed=0):
         skyline=torch.randint(-1, 3, (count,), generator=generator).int(),
     )
     around = Surroundings(
-        extinction_per_m=0.02,
-        airlight=rand(3),
-        sky_light=rand(3),
-        skylines=rand(3, 8, 4),
+        extinction_per_m=0.02, airlight=rand(3), sky_light=rand(3), skylines=rand(3, 8, 4)
     )
     heading = unit((rand(lamps, 3) - 0.5) * torch.tensor([1.0, 1.0, 0.0]), dim=1)
     heading[::2] = 0

@@ -29,12 +29,7 @@ from lidarpainter_models.geometry.transforms import (
     transform_points,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
 
 HALF_TURN_US = 25_000
 SCENE_NAME = "scene-0061"
@@ -351,11 +346,7 @@ def _when_seen(track, scene):
             pose = _uniformly(track, time_ns)
         times_ns.append(time_ns)
         poses.append(pose)
-    return replace(
-        track,
-        timestamps_ns=torch.tensor(times_ns),
-        world_from_box=torch.stack(poses),
-    )
+    return replace(track, timestamps_ns=torch.tensor(times_ns), world_from_box=torch.stack(poses))
 
 
 def _uniformly(track, time_ns):

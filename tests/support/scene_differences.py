@@ -102,10 +102,7 @@ def _global_points(scene, frame_index):
 
 def _boxes_of(scene, frame_index):
     return {
-        track.actor_id: (
-            scene.global_from_world @ track.world_from_box[row],
-            track.size_m.double(),
-        )
+        track.actor_id: (scene.global_from_world @ track.world_from_box[row], track.size_m.double())
         for track in scene.tracks
         for row in np.flatnonzero(track.frame_indices.numpy() == frame_index)
     }

@@ -117,8 +117,7 @@ class ShortReconstruction:
 
     def _continued(self, guidance) -> GaussianScene:
         config = replace(
-            continuation(self.config, looks=ROUND_LOOKS, guidance=GuidanceConfig()),
-            seed=self.seed,
+            continuation(self.config, looks=ROUND_LOOKS, guidance=GuidanceConfig()), seed=self.seed
         )
         return lp.fit_gaussians(self.seen, config, start=self.first, guidance=guidance).scene
 

@@ -21,12 +21,7 @@ from waymo_truth import street_config, write_truth
 
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fisheye_street import FisheyeStreet
 
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 from lidarpainter_models.synthetic import SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import RigCamera
-from lidarpainter_models.synthetic.fisheye import FisheyeStreet
 
 CAMERAS = (
     RigCamera(name="left_fisheye", focal_per_width=0.714, yaw_rad=1.57, left_m=0.9),

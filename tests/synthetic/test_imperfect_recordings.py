@@ -14,8 +14,7 @@ from lidarpainter_models.synthetic import RigCamera, SyntheticStreetConfig
 from lidarpainter_models.synthetic.plan.ego_motion import Pace
 from lidarpainter_models.synthetic.sequence import record_street
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
-from lidarpainter_models.synthetic.world.pedestrians import draw_person
-from lidarpainter_models.synthetic.world.traffic import StreetActor
+from lidarpainter_models.synthetic.world.traffic import StreetActor, draw_person
 
 READOUT_S = 0.03
 SMALL = {"seed": 7, "num_frames": 3, "width_px": 96, "height_px": 64}

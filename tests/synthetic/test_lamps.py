@@ -9,18 +9,19 @@ import pytest
 import torch
 from drawn_streets import drawn_street
 
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    SyntheticStreet,
-    SyntheticStreetConfig,
-)
+from lidarpainter_models.synthetic import RigCamera, SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.plan.car_kinds import SHAPES
 from lidarpainter_models.synthetic.street import START_NS
 from lidarpainter_models.synthetic.textures.cars import add_car_surfaces
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
-from lidarpainter_models.synthetic.world.brake_lenses import PROUD_M, RIM_M, with_brake_lenses
 from lidarpainter_models.synthetic.world.car_shapes import build_car
-from lidarpainter_models.synthetic.world.lamps import Switching, SwitchingLamps
+from lidarpainter_models.synthetic.world.lamps import (
+    PROUD_M,
+    RIM_M,
+    Switching,
+    SwitchingLamps,
+    with_brake_lenses,
+)
 
 READOUT_S = 0.03
 CAMERA = RigCamera(name="front_camera", focal_per_width=3.0, readout_s=READOUT_S)

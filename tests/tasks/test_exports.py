@@ -16,9 +16,8 @@ from lidarpainter_models.gaussians.model.instance_images import SKY
 from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from tasks.exports.dataset import export_dataset
-from tasks.exports.scene import SceneRequest, export_scene
+from tasks.exports.scene import SceneRequest, export_images, export_scene, export_video
 from tasks.exports.sweeps import export_sweeps
-from tasks.exports.views import export_images, export_video
 from tasks.stored import load_scene
 from tasks.views.render import render
 

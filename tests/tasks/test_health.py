@@ -45,10 +45,7 @@ def test_a_driver_that_torch_cannot_use_is_warned_of(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     ("missing", "verdict", "detail"),
-    [
-        ({}, "ok", "triton on the GPU"),
-        ({"triton": "no gcc"}, "warn", "not triton: no gcc"),
-    ],
+    [({}, "ok", "triton on the GPU"), ({"triton": "no gcc"}, "warn", "not triton: no gcc")],
 )
 def test_the_rasteriser_of_a_gpu_is_named(monkeypatch, tmp_path, missing, verdict, detail):
     monkeypatch.setattr(backends, "why_missing", lambda _kernel, backend: missing.get(backend))

@@ -28,17 +28,12 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.storage.tensor_files import read_tensors
-from tasks.evaluation.views import (
-    evaluate,
-    evaluate_by_neurad,
-    evaluate_flicker,
-    load_scores,
-)
+from tasks.evaluation.views import evaluate, evaluate_by_neurad, evaluate_flicker, load_scores
 from tasks.opened import open_scene
 from tasks.painter.evaluate import score_painters
 from tasks.painter.held_out_fits import HeldOutFit
 from tasks.reconstruction.fit import fit, refine
-from tasks.reconstruction.painted_views import load_guidance
+from tasks.reconstruction.paint import load_guidance
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, end_run
 from tasks.runs import open_run
@@ -128,7 +123,7 @@ def negatives(path):
 def test_a_round_that_makes_views_worse_is_to_be_taken_back(store, parameters, stages, monkeypatch):
     run, painted = parameters.run_spec(store.root), stages["paint-1"].ref
     first = FittedRef(stages["prepare"].ref, stages["fit"].ref)
-    monkeypatch.setattr("tasks.reconstruction.painted_views.read_tensors", negatives)
+    monkeypatch.setattr("tasks.reconstruction.paint.read_tensors", negatives)
     guidance = replace(parameters.refine.guidance, probability=1.0, until=1.0, weight=20.0)
     config = replace(parameters.refine, steps=60, guidance=guidance)
     spoilt = refine.fn(run, "refine-1", first, config, guidance=painted)

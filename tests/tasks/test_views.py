@@ -49,10 +49,7 @@ def test_what_is_said_of_frames_is_by_the_calibration_of_their_run(viewed, tmp_p
 
 @pytest.mark.parametrize("images", ["rendered", "recorded"])
 def test_a_run_is_shown_in_fog_beside_the_clear_images(viewed, tmp_path, images):
-    view = ViewRequest(
-        trajectory=parse_trajectory("recorded"),
-        frames=slice(1, 3),
-    )
+    view = ViewRequest(trajectory=parse_trajectory("recorded"), frames=slice(1, 3))
     style = StyleRequest(mix=StyleMix.parse("foggy"), images=images)
     made = stylize(viewed, view, style, tmp_path / "a")
     assert made["num_images"] == 2
@@ -70,10 +67,7 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(viewed, tmp_path, images)
 
 def test_a_painter_is_asked_for_the_prompt(viewed, tmp_path):
     request = ViewRequest(
-        trajectory=parse_trajectory("recorded"),
-        frames=slice(1, 2),
-        is_painted=True,
-        prompt="foggy",
+        trajectory=parse_trajectory("recorded"), frames=slice(1, 2), is_painted=True, prompt="foggy"
     )
     with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
         render(replace(viewed, run=replace(viewed.run, painter="nano")), request, tmp_path)
@@ -83,9 +77,7 @@ def test_a_painter_is_asked_for_the_prompt(viewed, tmp_path):
 
 def test_a_path_is_painted_with_the_previous_image_mixed_in(viewed, tmp_path):
     plain = ViewRequest(
-        trajectory=parse_trajectory("lateral:1"),
-        frames=slice(0, 3),
-        is_painted=True,
+        trajectory=parse_trajectory("lateral:1"), frames=slice(0, 3), is_painted=True
     )
     mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
     for name, request in (("plain", plain), ("mixed", mixed)):
@@ -100,18 +92,13 @@ def test_a_path_is_painted_with_the_previous_image_mixed_in(viewed, tmp_path):
 
 
 def test_recorded_images_exist_only_where_somebody_stood():
-    view = ViewRequest(
-        trajectory=parse_trajectory("lateral:2"),
-    )
+    view = ViewRequest(trajectory=parse_trajectory("lateral:2"))
     with pytest.raises(ConfigError, match="on the recorded trajectory"):
         StyleRequest(mix=StyleMix.parse("foggy"), images="recorded").check(view)
 
 
 def test_an_unknown_camera_is_named_before_anything_is_drawn(viewed, tmp_path):
-    request = ViewRequest(
-        trajectory=parse_trajectory("recorded"),
-        camera="back",
-    )
+    request = ViewRequest(trajectory=parse_trajectory("recorded"), camera="back")
     with pytest.raises(SceneError, match="has no camera 'back', it has front"):
         render(viewed, request, tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -120,9 +107,7 @@ def test_an_unknown_camera_is_named_before_anything_is_drawn(viewed, tmp_path):
 def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(viewed, tmp_path):
     places = tmp_path / "places.csv"
     places.write_text("x_m,y_m,yaw_deg\n0,0,0\n20,-4,0\n")  # the wall is at 20 m
-    request = ViewRequest(
-        trajectory=parse_trajectory(f"waypoints:{places}"),
-    )
+    request = ViewRequest(trajectory=parse_trajectory(f"waypoints:{places}"))
     out = tmp_path / "out"
     with pytest.raises(ConfigError, match=r"leads the camera into a wall: \d+ LiDAR points from"):
         render(viewed, request, out)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.training_data import corruptions
-from lidarpainter_models.training_data.corruptions import (
+from lidarpainter_models.training_data import harvest_targets
+from lidarpainter_models.training_data.harvest_targets import (
     corrupt_gaussians,
     drop_balls,
     fade_balls,
@@ -75,14 +75,14 @@ def test_dropped_balls_leave_the_rest_as_it_was():
 
 
 def test_balls_lie_near_and_spare_actors(monkeypatch):
-    monkeypatch.setattr(corruptions, "REACH_M", 5.0)
-    monkeypatch.setattr(corruptions, "BALLS", (50, 50))
+    monkeypatch.setattr(harvest_targets, "REACH_M", 5.0)
+    monkeypatch.setattr(harvest_targets, "BALLS", (50, 50))
     gaussians = street()
     inside = random_balls(gaussians, HERE, torch.Generator().manual_seed(0))
     assert bool(inside.any())
     assert not bool(inside[gaussians.body_index > 0].any())
     distance_m = (gaussians.means - HERE).norm(dim=1)
-    assert float(distance_m[inside].max()) < 5.0 * (1 + corruptions.RADIUS_SHARE[1])
+    assert float(distance_m[inside].max()) < 5.0 * (1 + harvest_targets.RADIUS_SHARE[1])
 
 
 def test_paint_is_bright_and_lies_flat():

@@ -5,8 +5,7 @@ from gaussian_world import build_world, camera_at, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
-from lidarpainter_models.viewing.browser_splats import recorded_rgb, splats_by_body
-from lidarpainter_models.viewing.scene_nodes import sky_panels
+from lidarpainter_models.viewing.scene_nodes import recorded_rgb, sky_panels, splats_by_body
 
 AHEAD_M = torch.tensor([[8.0, 0.0, 1.0]])
 GREY = torch.full((1, 3), 0.5)

@@ -18,11 +18,7 @@ from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
 from lidarpainter_models.gaussians.model.sky import MIN_TRANSMITTANCE
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses import (
-    PixelFacts,
-    PixelRules,
-    pixel_terms,
-)
+from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, pixel_terms
 from lidarpainter_models.kernels.pixel_losses.reference import clear_sky_loss, depth_loss
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView

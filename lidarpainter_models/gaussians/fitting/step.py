@@ -44,10 +44,7 @@ which of it shows nothing."""
 
 
 def fit_step(
-    state: FitState,
-    image: FitImage,
-    row: int,
-    guidance: tuple[int, GuidanceView] | None = None,
+    state: FitState, image: FitImage, row: int, guidance: tuple[int, GuidanceView] | None = None
 ) -> Float[Tensor, "2"]:
     """Step everything by one recorded view and a painted one, if given; each at its place.
 
@@ -104,10 +101,7 @@ def _recorded_gradients(
     with_actors = _wants_actor_term(state)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     splat = posed.draw(
-        seen,
-        with_actor_alpha=with_actors,
-        channel=probe,
-        screen_gradient_out=screen_gradient,
+        seen, with_actor_alpha=with_actors, channel=probe, screen_gradient_out=screen_gradient
     )
     rays = sky.rays(posed.camera, (splat.alpha.detach() < OPAQUE) | (image.kind == OPEN))
     sky_rgb = sky.sample(rays).requires_grad_(True)
@@ -150,10 +144,7 @@ def _wants_actor_term(state: FitState) -> bool:
 
 
 def _step_sky(state: FitState, found: _OfRecorded, image: FitImage) -> None:
-    """Move the texels that were seen clearly enough, inside the sky mask alone.
-
-    What is far but solid (towers beyond the LiDAR's reach) is left to the Gaussians.
-    """
+    """Move the texels that were seen clearly enough, inside the sky mask alone."""
     if found.sky_rgb.grad is None:
         return
     clear = 1 - found.splat.alpha.detach()

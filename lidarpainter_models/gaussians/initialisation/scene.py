@@ -327,11 +327,7 @@ def _surfels(
 def _actor_spacing(
     points: MapPoints, track: ActorTrack, views: Sequence[TrainingView]
 ) -> Float[Tensor, " points"]:
-    """Distance at which detail pays at each point of an actor over its time, as on the street.
-
-    The views are those at whose times it is there. A point in no image counts as in the nearest it
-    might be in; one beyond is infinite.
-    """
+    """Distance at which detail pays at each point of an actor over its time, as on the street."""
     footprint = torch.full((len(points),), torch.inf)
     total = torch.zeros(len(points))
     asked = sampled_views(views, _MOST_VIEWS_PER_ACTOR)

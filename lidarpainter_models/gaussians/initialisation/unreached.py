@@ -18,11 +18,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.observations.plane_sweep import (
-    choose_depth,
-    sweep_cost,
-    sweep_depths,
-)
+from lidarpainter_models.observations.plane_sweep import choose_depth, sweep_cost, sweep_depths
 from lidarpainter_models.observations.views import TrainingView
 
 COMPARED_VIEWS = 3

@@ -52,10 +52,7 @@ class Actors:
 
     @classmethod
     def uncorrected(
-        cls,
-        tracks: Sequence[ActorTrack],
-        knots_ns: Int[Tensor, " knots"],
-        bent: Sequence[int] = (),
+        cls, tracks: Sequence[ActorTrack], knots_ns: Int[Tensor, " knots"], bent: Sequence[int] = ()
     ) -> "Actors":
         """Nothing corrected yet; knots are sorted and taken once, the `bent` tracks may bend."""
         knots = torch.unique(knots_ns)

@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.devices import on_device
-from lidarpainter_models.gaussians.model.bending import knots_around
+from lidarpainter_models.gaussians.model.bending import knots_around, lattice_values
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
-from lidarpainter_models.geometry.lattices import lattice_values
 
 NODES = (5, 5, 5)
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]

@@ -114,10 +114,7 @@ class GaussianScene:
         return PosedScene.of(self.actors, self.blinking, camera, taken_ns, poses=poses)
 
     def posed_in_fit(
-        self,
-        camera: Camera,
-        taken_ns: int,
-        world_from_camera: Float[Tensor, "4 4"] | None = None,
+        self, camera: Camera, taken_ns: int, world_from_camera: Float[Tensor, "4 4"] | None = None
     ) -> PosedScene:
         """The scene before a camera at a training time; differentiable in poses and bending.
 
@@ -137,10 +134,7 @@ class GaussianScene:
         return gaussians_at(self.gaussians, self.actors, self.blinking, timestamp_ns)
 
     def _in_view(self, posed: PosedScene) -> Int[Tensor, " seen"] | None:
-        """Rows of the Gaussians that an image can show, and some more; None is all.
-
-        Of a running fit, whose Gaussians move, those are all.
-        """
+        """Rows of the Gaussians that an image can show, and some more; None is all."""
         if self.gaussians.means.requires_grad:
             return None
         reach_m = self.actors.bending.reach_m(posed.taken_ns)
@@ -149,11 +143,7 @@ class GaussianScene:
 
     @cached_property
     def _blocks(self) -> SpatialBlocks:
-        """Of Gaussians that stay as they are, but for what a rolling shutter makes of them.
-
-        Raises:
-            ShapeError: Gaussians belong to bodies that the scene does not have.
-        """
+        """Of Gaussians that stay as they are, but for what a rolling shutter makes of them."""
         bodies, body_index = 1 + len(self.actors.recorded_tracks), self.gaussians.body_index
         lowest, highest = torch.cat([body_index, body_index.new_zeros(1)]).aminmax()
         if int(lowest) < 0 or int(highest) >= bodies:

@@ -149,10 +149,7 @@ class RefinedTracks:
         return tangent_from_rigid(invert_rigid(self.recorded) @ self.refined)
 
     def _corrected(
-        self,
-        bodies: Int[Tensor, " queries"],
-        line: Samples,
-        recorded: Float[Tensor, "queries 4 4"],
+        self, bodies: Int[Tensor, " queries"], line: Samples, recorded: Float[Tensor, "queries 4 4"]
     ) -> Float[Tensor, "queries 4 4"]:
         """The recorded poses, corrected as their neighbours in time are on average."""
         corrections = self._corrections[bodies[:, None], line.rows]

@@ -51,9 +51,7 @@ def as_read(
         camera,
     )
     return replace(
-        gaussians,
-        means=gaussians.means + offset_m,
-        log_scale=gaussians.log_scale + log_growth,
+        gaussians, means=gaussians.means + offset_m, log_scale=gaussians.log_scale + log_growth
     )
 
 

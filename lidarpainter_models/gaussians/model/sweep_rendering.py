@@ -87,8 +87,7 @@ def trace_sweep(
     hits = [one.hits for one in found]
     rest = {name: torch.cat([getattr(one, name) for one in found])[back] for name in BLENDED}
     return RayReturns(
-        **rest,
-        hits=RayHits(*(torch.cat(column)[back] for column in zip(*hits, strict=True))),
+        **rest, hits=RayHits(*(torch.cat(column)[back] for column in zip(*hits, strict=True)))
     )
 
 

@@ -28,11 +28,7 @@ def _along(pose: np.ndarray, axis: int, point: np.ndarray) -> float:
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _owners(
-    points_m: np.ndarray,
-    poses: np.ndarray,
-    half_m: np.ndarray,
-    margin_m: float,
-    floor_m: float,
+    points_m: np.ndarray, poses: np.ndarray, half_m: np.ndarray, margin_m: float, floor_m: float
 ) -> np.ndarray:
     owners = np.full(points_m.shape[0], -1, np.int64)
     for i in numba.prange(points_m.shape[0]):

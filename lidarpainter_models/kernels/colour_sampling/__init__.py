@@ -137,10 +137,7 @@ def sample_levels(
 
 
 def combine_samples(
-    best: BestSamples,
-    view_gain: Float[np.ndarray, "views 3"],
-    *,
-    backend: Backend = "auto",
+    best: BestSamples, view_gain: Float[np.ndarray, "views 3"], *, backend: Backend = "auto"
 ) -> tuple[UInt8[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
     """One colour per point from its samples, and whether it has any.
 

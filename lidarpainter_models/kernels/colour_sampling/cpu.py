@@ -24,11 +24,7 @@ def project_inside(
 
 @numba.njit(cache=True, nogil=True)
 def _project_inside(
-    xyz_m: np.ndarray,
-    pixels_from_points: np.ndarray,
-    width_px: int,
-    height_px: int,
-    near_m: float,
+    xyz_m: np.ndarray, pixels_from_points: np.ndarray, width_px: int, height_px: int, near_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, continuous pixels (rows, 2) and depth of the points that fall into an image."""
     m = pixels_from_points.astype(np.float32)
@@ -79,11 +75,7 @@ def insert_samples(
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def steps_inside(
-    cells_uv: np.ndarray,
-    depth_m: np.ndarray,
-    inner_m: np.ndarray,
-    reach: int,
-    tolerance: float,
+    cells_uv: np.ndarray, depth_m: np.ndarray, inner_m: np.ndarray, reach: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """See `colour_sampling.steps_inside`."""
     steps = np.zeros((depth_m.shape[0], 2), dtype=np.float32)

@@ -10,10 +10,7 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.kernels.frustum_culling import Blocks, Look, plane_rows
-from lidarpainter_models.kernels.frustum_culling.triton_kernels import (
-    bound_blocks,
-    mark_blocks,
-)
+from lidarpainter_models.kernels.frustum_culling.triton_kernels import bound_blocks, mark_blocks
 from lidarpainter_models.kernels.gpu_packages import dense_in_place
 
 

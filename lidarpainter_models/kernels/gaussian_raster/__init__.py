@@ -157,11 +157,7 @@ def render_gaussians(
 
 
 def _check_tensor(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor) -> None:
-    """Refuse another shape or kind of numbers, or another device than the centres'.
-
-    Raises:
-        ShapeError: it is not as it must be.
-    """
+    """Refuse another shape or kind of numbers, or another device than the centres'."""
     if tuple(value.shape) != shape:
         raise ShapeError(f"{name} needs shape {shape}, got {tuple(value.shape)}")
     if value.is_floating_point() == (name == "body_index"):

@@ -259,11 +259,7 @@ def _walk_tile(
 
 @compiled_entry
 def entry_sums(
-    records: np.ndarray,
-    features: np.ndarray,
-    lists: TileLists,
-    drawn: Images,
-    gradients: Images,
+    records: np.ndarray, features: np.ndarray, lists: TileLists, drawn: Images, gradients: Images
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the pixels of each entry of the tile lists.
 

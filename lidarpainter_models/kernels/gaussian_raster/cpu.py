@@ -38,12 +38,7 @@ def draw_view(
 ) -> DrawnImages:
     """Images as `SplatImage` lists them."""
     drawn: DrawnImages = _DrawView.apply(
-        *splats.learned,
-        features,
-        camera_from_body,
-        splats.body_index,
-        camera,
-        screen_gradient_out,
+        *splats.learned, features, camera_from_body, splats.body_index, camera, screen_gradient_out
     )
     return drawn
 

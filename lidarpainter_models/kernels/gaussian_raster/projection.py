@@ -173,11 +173,7 @@ def _write(records: np.ndarray, rows: Rows, column: int, value: float) -> None:
 
 @numba.njit(**EXACT)
 def _write_colour(
-    gaussians: Gaussians,
-    rows: Rows,
-    footprint: Footprint,
-    weights: np.ndarray,
-    records: np.ndarray,
+    gaussians: Gaussians, rows: Rows, footprint: Footprint, weights: np.ndarray, records: np.ndarray
 ) -> float:
     """Write colours; return by how much they are off black, before they are cut off there."""
     mean = vector_of(gaussians.means, rows)

@@ -128,10 +128,7 @@ def _nodes(state: AdamState, rows: np.ndarray) -> _Nodes:
 
 @numba.njit(cache=True, nogil=True)
 def _pair(rates, left, begin, end):
-    """Two nodes (weights, depths) with the moments of the missed steps `begin` to `end`.
-
-    The earlier one comes first; a run of one step has one node, the other weighs nothing.
-    """
+    """Two nodes (weights, depths) with the moments of the missed steps `begin` to `end`."""
     total, mean, spread, skew = 0.0, 0.0, 0.0, 0.0
     for j in range(begin, end + 1):
         share = rates[j - 1] * BETA1**j / (1.0 - BETA1 ** (left + j))

@@ -73,10 +73,7 @@ def _steps(
 def _two_nodes(
     share: Float[np.ndarray, "steps missed kinds"], depth: Float[np.ndarray, "steps missed kinds"]
 ) -> tuple[Float[np.ndarray, "missed kinds"], ...]:
-    """Weight and depth of two nodes (Gauss' rule for a discrete measure), the earlier one first.
-
-    A run of one step is one node, and the other weighs nothing.
-    """
+    """Weight and depth of two nodes (Gauss' rule for a discrete measure), the earlier one first."""
     total = share.sum(axis=0)
     safe = np.where(total > 0, total, 1.0)
     mean = (share * depth).sum(axis=0) / safe

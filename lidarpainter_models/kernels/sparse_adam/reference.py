@@ -110,10 +110,7 @@ def _in_units(
     log_scale: Float[Tensor, "rows 3"],
     lead: Float[Tensor, " rows"] | None = None,
 ) -> Float[Tensor, "rows columns"]:
-    """Moves with those of centres in units of the Gaussian's size, in place.
-
-    The size is the one that it has after the part `lead` (None: nothing) of the move.
-    """
+    """Moves with those of centres in units of the Gaussian's size, in place."""
     if lead is not None:
         log_scale = log_scale - lead[:, None] * move[:, _LOG_SCALE]
     size_m = (0.5 * (log_scale.sum(dim=1) - log_scale.amin(dim=1))).exp()

@@ -131,12 +131,7 @@ def _with_nodes(state: AdamState) -> DeviceRates:
     there.fill(count)
     if there.nodes_of != count:
         kernels.write_nodes[(triton.cdiv(count, NUMBERS_AT_ONCE), len(MISSED_RUN_ENDS))](
-            there.rates,
-            there.run_ends,
-            there.nodes,
-            count,
-            state.count,
-            BLOCK=NUMBERS_AT_ONCE,
+            there.rates, there.run_ends, there.nodes, count, state.count, BLOCK=NUMBERS_AT_ONCE
         )
         there.nodes_of = count
     return there

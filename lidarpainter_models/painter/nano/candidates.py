@@ -140,10 +140,7 @@ def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height
 
 
 def with_flat_colour(
-    candidates: Candidates,
-    name: str,
-    rgb: Float[Tensor, "batch 3"],
-    exists: Bool[Tensor, " batch"],
+    candidates: Candidates, name: str, rgb: Float[Tensor, "batch 3"], exists: Bool[Tensor, " batch"]
 ) -> Candidates:
     """One more candidate: a colour of its own for every view, or none for views without."""
     flat = rgb[..., None, None].expand_as(candidates.base_image)

@@ -205,11 +205,7 @@ class NanoNetwork(nn.Module):
         return halved
 
     def forward(
-        self,
-        conditions: ConditionBatch,
-        prompts: Sequence[str],
-        *,
-        half_precision: bool = False,
+        self, conditions: ConditionBatch, prompts: Sequence[str], *, half_precision: bool = False
     ) -> NanoOutput:
         """Mix the candidates of every view.
 
@@ -232,10 +228,7 @@ class NanoNetwork(nn.Module):
             head = self._head(features, embedding, style)
         rgb, weights = self._image(head, candidates, style)
         return NanoOutput(
-            rgb=rgb,
-            base=candidates.base_image,
-            log_error=head[:, -1].clamp(-8, 1),
-            weights=weights,
+            rgb=rgb, base=candidates.base_image, log_error=head[:, -1].clamp(-8, 1), weights=weights
         )
 
     def _image(

@@ -5,19 +5,81 @@ from typing import Any
 import torch
 from torch import nn
 
+from lidarpainter_models.painter.one_step.architectures import diffusion_package
 from lidarpainter_models.painter.one_step.autoencoder import SkipAutoencoder, TinyAutoencoder
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import Denoiser
 from lidarpainter_models.painter.one_step.latent_fusion import LatentFusion
-from lidarpainter_models.painter.one_step.lora import (
-    ADAPTER_MARK,
-    AUTOENCODER_TARGETS,
-    UNET_TARGETS,
-    add_lora,
-    merge_lora,
-)
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
-from lidarpainter_models.painter.one_step.upsampling import phase_upsamplings
+
+UNET_TARGETS = (
+    "to_k",
+    "to_q",
+    "to_v",
+    "to_out.0",
+    "conv",
+    "conv1",
+    "conv2",
+    "conv_shortcut",
+    "conv_out",
+    "proj_in",
+    "proj_out",
+    "ff.net.2",
+    "ff.net.0.proj",
+)
+AUTOENCODER_TARGETS = (
+    "conv1",
+    "conv2",
+    "conv_in",
+    "conv_shortcut",
+    "conv",
+    "conv_out",
+    "to_k",
+    "to_q",
+    "to_v",
+    "to_out.0",
+)
+ADAPTER_MARK = ".lora_"
+"""Stands in the name of every weight of an adapter."""
+
+
+def add_lora(module: nn.Module, *, rank: int, targets: tuple[str, ...]) -> None:
+    """Put adapters beside the layers whose names end like a target; they change nothing at first.
+
+    Scaled by one (`alpha` = rank). Nothing happens at rank 0.
+    """
+    if rank == 0:
+        return
+    peft = diffusion_package("peft")
+    config = peft.LoraConfig(
+        r=rank, lora_alpha=rank, target_modules=list(targets), init_lora_weights="gaussian"
+    )
+    peft.inject_adapter_in_model(config, module)
+
+
+@torch.no_grad()
+def merge_lora(module: nn.Module) -> None:
+    """Add every adapter to the layer beside it and take it away: fewer layers, the same function.
+
+    The sum is taken in float32 and rounded once.
+    """
+    for parent in list(module.modules()):
+        for name, child in list(parent.named_children()):
+            if is_adapted(child):
+                adapted: Any = child
+                base = adapted.get_base_layer()
+                for adapter in adapted.active_adapters:
+                    adapted.lora_A[adapter].to(torch.float32)  # in place
+                    adapted.lora_B[adapter].to(torch.float32)
+                    delta = adapted.get_delta_weight(adapter)
+                    base.weight.copy_(base.weight.float() + delta)
+                setattr(parent, name, base)
+
+
+def is_adapted(module: nn.Module) -> bool:
+    """Whether peft has wrapped a layer."""
+    return hasattr(module, "get_base_layer") and hasattr(module, "lora_A")
+
 
 FIRST_LAYER = "denoiser.unet.conv_in."
 LAST_LAYER = "denoiser.unet.conv_out."
@@ -59,13 +121,6 @@ def _autoencoder_parts(
         return TinyAutoencoder(autoencoder)
     has_skips = config.skips != "none"
     return SkipAutoencoder(autoencoder, has_skips=has_skips, skip_bias=config.skip_bias)
-
-
-def made_lean(network: OneStepNetwork) -> OneStepNetwork:
-    """The same network for use alone, in place: adapters merged, doublings by phases."""
-    merge_lora(network)
-    phase_upsamplings(network)
-    return network
 
 
 def trained_names(network: OneStepNetwork) -> list[str]:

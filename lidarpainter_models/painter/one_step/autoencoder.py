@@ -33,12 +33,7 @@ class SkipDecoder(nn.Module):
     """
 
     def __init__(
-        self,
-        decoder: nn.Module,
-        widths: Sequence[int],
-        *,
-        has_skips: bool,
-        skip_bias: bool,
+        self, decoder: nn.Module, widths: Sequence[int], *, has_skips: bool, skip_bias: bool
     ) -> None:
         """Take the decoder of a diffusers `AutoencoderKL`.
 

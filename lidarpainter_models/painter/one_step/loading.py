@@ -15,7 +15,7 @@ import torch
 from lidarpainter_models.errors import ConfigError, WeightsError
 from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX, split_preset
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.assembly import assemble, made_lean, trained_in_float32
+from lidarpainter_models.painter.one_step.assembly import assemble, merge_lora, trained_in_float32
 from lidarpainter_models.painter.one_step.base_models import (
     BaseModel,
     BaseParts,
@@ -75,16 +75,12 @@ def load_one_step(
         _check_mark(file, parts)
         apply_trained(network, file)
         origin = file.provenance | origin | {"licence": file.licence}
-    return OneStepPainter(made_lean(network), prompts, origin).to(device)
+    merge_lora(network)
+    return OneStepPainter(network, prompts, origin).to(device)
 
 
 def load_trainable(
-    name: str,
-    config: OneStepConfig,
-    *,
-    prompts: Sequence[str],
-    dtype: torch.dtype,
-    seed: int = 0,
+    name: str, config: OneStepConfig, *, prompts: Sequence[str], dtype: torch.dtype, seed: int = 0
 ) -> Trainable:
     """A network to train, on the CPU.
 

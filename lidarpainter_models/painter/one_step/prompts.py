@@ -82,11 +82,7 @@ def encode_text(folder: Path, text: str) -> Float[Tensor, "tokens features"]:
             output_loading_info=True,
         )
         tokens = tokenizer(
-            text,
-            max_length=TEXT_TOKENS,
-            padding="max_length",
-            truncation=True,
-            return_tensors="pt",
+            text, max_length=TEXT_TOKENS, padding="max_length", truncation=True, return_tensors="pt"
         ).input_ids
         text_features = run_text_encoder(encoder, tokens)
     except Exception as error:  # noqa: BLE001 - many kinds for one thing: the files do not fit

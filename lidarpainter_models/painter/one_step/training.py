@@ -31,10 +31,9 @@ from lidarpainter_models.painter.losses import (
     known_image,
     paper_loss,
 )
-from lidarpainter_models.painter.one_step.assembly import trained_in_float32
+from lidarpainter_models.painter.one_step.assembly import is_adapted, trained_in_float32
 from lidarpainter_models.painter.one_step.autoencoder import SkipAutoencoder
 from lidarpainter_models.painter.one_step.config import OneStepConfig
-from lidarpainter_models.painter.one_step.lora import is_adapted
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import NUM_WARPS, STRIDE_PX, painter_inputs
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT

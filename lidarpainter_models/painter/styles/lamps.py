@@ -63,10 +63,7 @@ class Lamp:
     def window(self) -> tuple[slice, slice]:
         """Where the patch lies."""
         rows, columns = self.patch.shape
-        return (
-            slice(self.top_px, self.top_px + rows),
-            slice(self.left_px, self.left_px + columns),
-        )
+        return (slice(self.top_px, self.top_px + rows), slice(self.left_px, self.left_px + columns))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -111,9 +111,7 @@ def _relit(
     return _with_noise(glowing, generator)
 
 
-def _without_specks(
-    distance_m: Float[Tensor, "height width"],
-) -> Float[Tensor, "height width"]:
+def _without_specks(distance_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """The median of five by five pixels: light falls off smoothly on a road."""
     return 1 / torch.from_numpy(cv2.medianBlur((1 / distance_m).numpy(), 5))
 

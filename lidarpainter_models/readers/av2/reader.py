@@ -36,11 +36,7 @@ from lidarpainter_models.readers.av2.sweeps import (
     read_sweep,
 )
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame, poses_at
-from lidarpainter_models.readers.source_logs.feather_tables import (
-    Kind,
-    read_feather,
-    stated_poses,
-)
+from lidarpainter_models.readers.source_logs.feather_tables import Kind, read_feather, stated_poses
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.readers.source_logs.sweep_frames import nearest_images
@@ -111,9 +107,7 @@ class Av2Log:
         self.global_from_world = level_frame(city_from_ego)
         self._world_from_city = invert_rigid(self.global_from_world)
         self.header = SceneHeader(
-            licence=LICENCE,
-            global_from_world=self.global_from_world,
-            more=_global_frame(folder),
+            licence=LICENCE, global_from_world=self.global_from_world, more=_global_frame(folder)
         )
         self._boxes = with_motion(self._read_boxes())
         self._images = {

@@ -23,11 +23,7 @@ from lidarpainter_models.readers.canonical.checks import (
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import image_of_row
-from lidarpainter_models.scenes.frame_content import (
-    FrameContent,
-    SourceImage,
-    SourceSweep,
-)
+from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord, SweepPoints
 from lidarpainter_models.scenes.stored import StoredScene
 from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_name, require_pose

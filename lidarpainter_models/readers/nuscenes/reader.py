@@ -42,11 +42,7 @@ from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, LidarPoints, re
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame, pose_at
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
-from lidarpainter_models.scenes.frame_content import (
-    FrameContent,
-    SourceImage,
-    SourceSweep,
-)
+from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -130,9 +126,7 @@ class NuscenesLog:
             height_px=height_px,
         )
         record = ImageRecord(
-            camera_name=image.calibration.channel,
-            timestamp_ns=image.timestamp_ns,
-            camera=camera,
+            camera_name=image.calibration.channel, timestamp_ns=image.timestamp_ns, camera=camera
         )
         jpeg = self.source.read_bytes(image.file)
         return SourceImage(record=record, jpeg=jpeg, source=str(self.source.root / image.file))

@@ -99,11 +99,7 @@ def _numbers(column: np.ndarray, where: str) -> np.ndarray:
 
 
 def read_table_bytes(
-    content: bytes,
-    path: Path,
-    *,
-    max_bytes: int = MAX_TABLE_BYTES,
-    max_rows: int = MAX_TABLE_ROWS,
+    content: bytes, path: Path, *, max_bytes: int = MAX_TABLE_BYTES, max_rows: int = MAX_TABLE_ROWS
 ) -> Table:
     """The columns of one pickled pandas table, gzipped or, as some mirrors have it, unpacked.
 

@@ -12,22 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.checks.actors import NEAR_M
-from lidarpainter_models.checks.doctor import (
-    MAX_CAMERA_LAG_S,
-    MAX_SPEED_MPS,
-    MAX_TURN_RADPS,
-)
-from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
+from lidarpainter_models.checks.doctor import MAX_CAMERA_LAG_S, MAX_SPEED_MPS, MAX_TURN_RADPS
 from lidarpainter_models.checks.sweep_agreement import nearest_gap_m, points_near
+from lidarpainter_models.checks.sweeps import LidarReach, could_any_hit
 from lidarpainter_models.checks.verdicts import sampled_positions
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import turn_rad
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S
-from lidarpainter_models.scenes.frame_content import (
-    FrameContent,
-    SourceImage,
-    SourceSweep,
-)
+from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 
 MAX_MOUNT_M = 20.0
 """A sensor is on the car, which drives 9 m at most between the poses of both."""

@@ -120,12 +120,7 @@ def _numbers(column: pa.ChunkedArray, kind: Kind, where: str) -> np.ndarray:
 
 
 def _unpacked_bytes(content: bytes) -> int:
-    """What all batches of a file take in memory.
-
-    Raises:
-        ValueError: a batch is not where the footer says, or its sizes make no sense.
-        struct.error: something lies beyond the end of the file.
-    """
+    """What all batches of a file take in memory."""
     if not content.startswith(_MAGIC) or not content.endswith(_MAGIC):
         raise ValueError("it does not begin and end with ARROW1")
     (length,) = struct.unpack_from("<i", content, len(content) - len(_MAGIC) - 4)

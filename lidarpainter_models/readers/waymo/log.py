@@ -147,10 +147,7 @@ def checked_speed(x_mps: float, y_mps: float, place: str) -> float:
 
 
 def checked_frame(
-    start_us: int,
-    global_from_vehicle: Sequence[float],
-    labels: tuple[WaymoLabel, ...],
-    place: str,
+    start_us: int, global_from_vehicle: Sequence[float], labels: tuple[WaymoLabel, ...], place: str
 ) -> WaymoFrame:
     """A frame with a time and a pose that make sense."""
     if not 0 < start_us < _MAX_TIMESTAMP_US:

@@ -68,12 +68,7 @@ def unpack_matrix(compressed: bytes, channels: int, where: str) -> np.ndarray:
     return shaped_matrix(np.frombuffer(message.data, np.uint8), message.shape.dims, channels, where)
 
 
-def shaped_matrix(
-    values: np.ndarray,
-    shape: object,
-    channels: int,
-    where: str,
-) -> np.ndarray:
+def shaped_matrix(values: np.ndarray, shape: object, channels: int, where: str) -> np.ndarray:
     """Give the bytes or float32 numbers of a matrix its shape, which is checked first.
 
     Raises:
@@ -98,9 +93,7 @@ def shaped_matrix(
 
 
 def range_points(
-    sweep: WaymoSweep,
-    calibration: LidarCalibration,
-    global_from_vehicle: Float[Tensor, "4 4"],
+    sweep: WaymoSweep, calibration: LidarCalibration, global_from_vehicle: Float[Tensor, "4 4"]
 ) -> RangePoints:
     """The points of a LiDAR's range images; a pixel without an echo has a range of 0 or less.
 
@@ -174,15 +167,9 @@ def _measured(image: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compensated(
-    xyz_m: np.ndarray,
-    poses: np.ndarray,
-    global_from_vehicle: Float[Tensor, "4 4"],
-    where: str,
+    xyz_m: np.ndarray, poses: np.ndarray, global_from_vehicle: Float[Tensor, "4 4"], where: str
 ) -> np.ndarray:
-    """Move points from the vehicle at each one's own pose to the vehicle at the frame's pose.
-
-    A pose is roll, pitch and yaw (turns about x, then y, then z) and a position.
-    """
+    """Move points from the vehicle at each one's own pose to the vehicle at the frame's pose."""
     frame = global_from_vehicle.to(torch.float64).numpy()
     moved_m = poses[:, 3:] - frame[:3, 3]
     if len(moved_m) and np.abs(moved_m).max() > _MAX_MOTION_M:

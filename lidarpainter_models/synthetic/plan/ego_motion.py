@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpainter_models.synthetic.plan.street_line import StreetLine
+from lidarpainter_models.synthetic.plan.layout import StreetLine
 
 SETTLING_S = 2.5
 

@@ -143,11 +143,7 @@ def _render_pixel(
 
 @numba.njit(**{**RAY, "_nrt": True, "parallel": True})
 def render_image(
-    scene: SceneArrays,
-    instances: InstanceArrays,
-    view: ViewArrays,
-    height_px: int,
-    width_px: int,
+    scene: SceneArrays, instances: InstanceArrays, view: ViewArrays, height_px: int, width_px: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Trace every pixel, all at one time or each row at its own.
 

@@ -15,11 +15,7 @@ from lidarpainter_models.synthetic.textures.signs import (
     stop_plate,
     street_name_plate,
 )
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, SurfaceSet, tint_from_bytes
 from lidarpainter_models.synthetic.world.lamps import Lens, SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder
 from lidarpainter_models.synthetic.world.solids import add_ball, add_box, add_tube

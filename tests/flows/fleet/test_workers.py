@@ -164,8 +164,7 @@ def test_an_end_that_finds_no_room_is_entered_once_there_is_some(asked, store, m
 
     worker.work, worker.say = work, lines.append
     monkeypatch.setattr(
-        "catalog.tables.shutil.disk_usage",
-        lambda _: usage._replace(free=0) if full[0] else usage,
+        "catalog.tables.shutil.disk_usage", lambda _: usage._replace(free=0) if full[0] else usage
     )
     monkeypatch.setattr("flows.fleet.worker.time.sleep", lambda _s: full.__setitem__(0, False))
     worker.run()

@@ -5,12 +5,12 @@ import pytest
 import torch
 from gaussian_world import round_gaussians
 
-from lidarpainter_models.gaussians.fitting.gaussian_adam import (
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
+from lidarpainter_models.gaussians.fitting.state import (
     COLOUR_PIXELS,
     LEAST_SHAPE_GRADIENT,
     GaussianAdam,
 )
-from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import LEAVES
 

@@ -3,7 +3,6 @@ from dataclasses import replace
 import pytest
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.clock import HALF_STEP, steps_within, work_of
 from lidarpainter_models.gaussians.fitting.config import (
     START_SHARE,
     DensificationConfig,
@@ -11,6 +10,7 @@ from lidarpainter_models.gaussians.fitting.config import (
     FitConfig,
     continuation,
 )
+from lidarpainter_models.gaussians.fitting.fit import HALF_STEP, steps_within, work_of
 from lidarpainter_models.gaussians.fitting.learning_rates import COLOUR_LOOKS, LearningRates
 from lidarpainter_models.gaussians.fitting.plan import planned_settings
 from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface

@@ -7,7 +7,6 @@ import torch
 from gaussian_world import FRAME_NS, round_gaussians
 from styled_world import START_M, camera_above, styled
 
-from lidarpainter_models.export.contents import scene_contents
 from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking, with_added_colour
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
 from lidarpainter_models.gaussians.model.stored_scene import (
@@ -15,7 +14,6 @@ from lidarpainter_models.gaussians.model.stored_scene import (
     scene_from_arrays,
     scene_to_arrays,
 )
-from lidarpainter_models.viewing.browser_splats import recorded_rgb
 
 KNOTS_NS = torch.tensor([0, 100, 300]) * 1_000_000
 RED = torch.tensor([0.5, 0.1, 0.0])
@@ -125,33 +123,6 @@ def test_colour_is_added_to_the_constant_harmonic_alone():
 def test_what_has_no_time_is_lit_on_average():
     lit = two_lamps().lit_on_average(gaussians([[5.0, 0.0, 1.0]], 0))
     assert torch.allclose(lit.base_rgb[0], 0.2 + 2 / 3 * RED, atol=1e-6)
-
-
-def lit_world(world):
-    """The world with a lamp around its car that goes on."""
-    lamp = replace(
-        lamps([1], [[0.0, 0.0, 0.0]], [[0.0], [1.0], [1.0]]), size_m=torch.full((1, 3), 4.0)
-    )
-    return replace(copy_scene(world.scene), blinking=lamp)
-
-
-def test_exports_of_a_moment_have_lamps_as_then_those_of_a_drive_as_on_average(world):
-    scene = lit_world(world)
-    dark, lit, drive = (
-        scene_contents(scene, "street", times).actors[0].gaussians.base_rgb
-        for times in ([0], [FRAME_NS], [0, FRAME_NS])
-    )
-    assert torch.allclose(lit - dark, RED.expand_as(lit), atol=1e-6)
-    assert torch.allclose(drive - dark, 2 / 3 * RED.expand_as(lit), atol=1e-6)
-
-
-def test_a_browser_shows_the_mean_of_what_the_cameras_saw(world):
-    scene = lit_world(world)
-    cameras = [(view.camera, view.timestamp_ns) for view in world.observations.views[:2]]
-    more = recorded_rgb(scene, cameras) - recorded_rgb(world.scene, cameras)
-    car = scene.gaussians.body_index == 1
-    assert float((more[car] - RED / 2).abs().median()) < 1e-5
-    assert not more[~car].any()
 
 
 def test_a_scene_in_a_style_keeps_its_lamps():

@@ -1,14 +1,11 @@
 """Every pixel knows whose it is."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.model import instance_images
 from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, instance_image
-from lidarpainter_models.geometry.cameras import Shutter
 
 
 def world_of_cars(num_cars):
@@ -46,18 +43,6 @@ def test_cars_are_told_apart_from_street_and_sky(monkeypatch, together):
         assert int(who[row, column]) == car
     assert int(who[0, 0]) == SKY
     assert int(who[-1, camera.width_px // 2]) == STREET
-
-
-def test_a_rolling_shutter_shows_actors_where_the_image_has_them():
-    scene = world_of_cars(4)
-    turning = torch.tensor([0.0, 4.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    shutter = Shutter(across_s=(0.1, 0.0), twist_per_s=turning)
-    camera = replace(camera_at(0.0), shutter=shutter)
-    shown = scene.render(camera, 0).actor_alpha > 0.5
-    at_once = scene.render(camera_at(0.0), 0).actor_alpha > 0.5
-    who = instance_image(scene, camera, 0)
-    is_actor = (who != STREET) & (who != SKY)
-    assert int((is_actor ^ shown).sum()) < 0.1 * int((at_once ^ shown).sum())
 
 
 def test_a_log_without_actors_has_street_and_sky():

@@ -28,7 +28,7 @@ def test_plyfile_finds_harmonics_channel_by_channel(tmp_path):
     vertex = file["vertex"]
     assert file.comments == ["metres"]
     assert [kind.name for kind in vertex.properties][:6] == [
-        *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
     ]
     for number in range(24):  # 8 of red, 8 of green, 8 of blue
         expected = gaussians.sh_rest[:, number % 8, number // 8].numpy()
@@ -105,10 +105,7 @@ def test_opaque_and_flat_gaussians_of_other_programs_are_read(tmp_path):
         (one(columns=ROW + b"element chunk 3\n"), "cannot use 'element chunk 3'"),
         (one(columns=ROW + b"property float x\n"), "cannot use 'property float x'"),
         (one(columns=ROW + b"property float f_rest_0\n", body=BODY * 2), "need a file of"),
-        (
-            one(columns=ROW + b"property float f_rest_0\n", body=BODY + b"0000"),
-            "has 1 f_rest",
-        ),
+        (one(columns=ROW + b"property float f_rest_0\n", body=BODY + b"0000"), "has 1 f_rest"),
         (one(columns=b"property float x\n", body=b"0000"), "holds no Gaussians, it lacks y"),
     ],
 )

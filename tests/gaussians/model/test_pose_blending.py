@@ -2,10 +2,7 @@ import math
 
 import torch
 
-from lidarpainter_models.gaussians.model.pose_blending import (
-    RefinedTracks,
-    tangent_from_rigid,
-)
+from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks, tangent_from_rigid
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 
 

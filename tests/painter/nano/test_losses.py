@@ -8,13 +8,13 @@ import torch
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.losses import as_numbers
-from lidarpainter_models.painter.nano.losses import (
+from lidarpainter_models.painter.nano.network import NanoOutput
+from lidarpainter_models.painter.nano.training import (
     NanoLossWeights,
     expected_error_loss,
     harm_loss,
     painting_loss,
 )
-from lidarpainter_models.painter.nano.network import NanoOutput
 
 
 def images(seed=0):

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError, ShapeError
-from lidarpainter_models.painter import input_hull as hulls
+from lidarpainter_models.painter import filters as hulls
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
-from lidarpainter_models.painter.filters import fill_push_pull
-from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
+from lidarpainter_models.painter.filters import HULL_MARGIN, fill_push_pull, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates
 from lidarpainter_models.painter.nano.features import painting_features
 from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork, PixelNorm
@@ -83,27 +82,6 @@ def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_cond
         changed = painter.paint(replace(conditions, **{name: getattr(other, name)}))
         is_same = torch.equal(changed.rgb, before.rgb)
         assert is_same == (name in blind_to), name
-
-
-@pytest.mark.parametrize(
-    ("size_px", "num_sources"), [((1, 1), 0), ((5, 3), 1), ((16, 16), 2), ((17, 31), 3)]
-)
-def test_views_of_any_size_and_number_of_warps_are_painted(size_px, num_sources, make_conditions):
-    painter = NanoPainter(scrambled(NanoConfig(**SMALL)))
-    painting = painter.paint(make_conditions(*size_px, num_sources))
-    assert painting.rgb.shape == (*size_px, 3)
-    assert painting.confidence.shape == size_px
-    assert bool(painting.rgb.isfinite().all())
-    assert 0 <= float(painting.rgb.min()) <= float(painting.rgb.max()) <= 1
-    assert 0 <= float(painting.confidence.min()) <= float(painting.confidence.max()) <= 1
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_painting_twice_gives_the_same_bits(threads, make_conditions):
-    torch.set_num_threads(threads)
-    painter = NanoPainter(scrambled(NanoConfig(**SMALL)))
-    conditions = make_conditions()
-    assert torch.equal(painter.paint(conditions).rgb, painter.paint(conditions).rgb)
 
 
 @pytest.mark.parametrize("prompt", ["clear", "foggy"])

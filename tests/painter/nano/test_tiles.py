@@ -8,9 +8,9 @@ import torch
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.tiles import (
+from lidarpainter_models.painter.nano.painter import (
     UNKNOWN_DOUBT,
+    NanoPainter,
     doubt,
     doubtful_tiles,
     painted_parts,

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.one_step.assembly import is_adapted, merge_lora
 from lidarpainter_models.painter.one_step.config import (
     PAPER,
     PRESETS,
@@ -14,7 +15,6 @@ from lidarpainter_models.painter.one_step.config import (
 )
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
 from lidarpainter_models.painter.one_step.latent_fusion import FusionConfig, LatentFusion
-from lidarpainter_models.painter.one_step.lora import is_adapted, merge_lora
 
 SKIPS = ("skip_conv_1", "skip_conv_2", "skip_conv_3", "skip_conv_4")
 

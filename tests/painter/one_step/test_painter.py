@@ -15,24 +15,11 @@ from lidarpainter_models.painter.one_step.config import (
 )
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.painter import painter_inputs, support
-from lidarpainter_models.painter.protocol import Painter
 
 
 @pytest.fixture(scope="module")
 def painter(model_folder):
     return load_one_step(f"{model_folder}:with-reference", dtype=torch.float32)
-
-
-@pytest.mark.parametrize(("size", "num_sources"), [((1, 1), 0), ((64, 64), 1), ((65, 127), 3)])
-def test_a_view_of_any_size_keeps_it(painter, size, num_sources, make_conditions):
-    conditions = make_conditions(*size, num_sources)
-    painting = painter.paint(conditions)
-    assert isinstance(painter, Painter)
-    assert painting.rgb.shape == (*size, 3)
-    assert painting.confidence.shape == size
-    for values in (painting.rgb, painting.confidence):
-        assert bool(((values >= 0) & (values <= 1)).all())
-    assert torch.equal(painter.paint(conditions).rgb, painting.rgb)
 
 
 def test_edges_are_repeated_below_and_to_the_right(make_conditions):

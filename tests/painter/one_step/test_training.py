@@ -15,11 +15,7 @@ from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.config import FAST, PAPER
 from lidarpainter_models.painter.one_step.loading import load_trainable
-from lidarpainter_models.painter.one_step.training import (
-    Judges,
-    OneStepTrainee,
-    train_one_step,
-)
+from lidarpainter_models.painter.one_step.training import Judges, OneStepTrainee, train_one_step
 from lidarpainter_models.painter.one_step.weights import save_trained
 from lidarpainter_models.painter.selection import load_painter
 

@@ -6,9 +6,13 @@ import pytest
 import torch
 
 from lidarpainter_models.painter.styles import rain
-from lidarpainter_models.painter.styles.rain import add_rain, fall_speed_mps
+from lidarpainter_models.painter.styles.rain import (
+    add_rain,
+    fall_speed_mps,
+    ground_pixels,
+    mirrored,
+)
 from lidarpainter_models.painter.styles.view import distances, fit_ground, surface_points
-from lidarpainter_models.painter.styles.wet_ground import ground_pixels, mirrored
 from lidarpainter_models.weather.air import rain_extinction_per_m
 from lidarpainter_models.weather.light import luminance, to_linear
 from lidarpainter_models.weather.water import fresnel, puddles, wet_reflectance

@@ -42,31 +42,20 @@ def nan_point(content):
 CASES = [
     (RAW, OXTS, lambda _: b"", "packet 1: expected 30 numbers"),
     (RAW, OXTS, lambda _: b"nan 8 116 0 0 0", "packet 1: nowhere on Earth"),
-    (RAW, OXTS, lambda _: b"90 8 116 0 0 0", "packet 1: nowhere on Earth"),
     (RAW, OXTS, lambda _: b"49 9 116 0 0 0", "from its LiDAR, expected 1000 m"),
     (RAW, TIMES, lambda _: b"", "no time, expected one for every frame"),
     (RAW, TIMES, lambda _: b"soon", "line 0: 'soon', expected a time as"),
-    (RAW, TIMES, lambda _: b"2011-13-26 13:02:25.594360375", "2011-13-26 13:02:25 is no date"),
-    (RAW, TIMES, lambda _: "höchste Zeit".encode(), "no text in ASCII"),
     (RAW, SWEEP, lambda content: content[:-3], "expected whole points of 16"),
     (RAW, SWEEP, nan_point, "point 7: holds something other than finite numbers"),
     (RAW, IMAGE, lambda _: b"GIF89a", "neither a JPEG nor a PNG image"),
-    (RAW, IMAGE, lambda content: content[: len(content) // 2], "0000000001.png"),
     (RAW, IMAGE, replaced(b"\x00\x00\x00\x60", b"\x7f\xff\xff\xff"), "expected at most 64 million"),
     (RAW, BOXES, lambda content: content[:-9], "no XML"),
     (RAW, BOXES, lambda _: b"<!DOCTYPE a [<!ENTITY b 'c'>]><a/>", "declares entities"),
-    (RAW, BOXES, replaced(b"<h>", b"<h>-"), "the box measures"),
     (RAW, BOXES, replaced(b"<tx>", b"<tx>x"), "expected finite numbers tx, ty, tz, rz"),
-    (RAW, BOXES, replaced(b"<first_frame>0", b"<first_frame>nan"), "expected finite numbers h, w"),
     (RAW, "calib_velo_to_cam.txt", replaced(b"R:", b"R: 7"), "R: 10 numbers, expected 9 finite"),
-    (RAW, "calib_velo_to_cam.txt", lambda _: b"T: 0 0 0\nR: 1 1 1 1 1 1 1 1 1", "rotation and a"),
     (RAW, "calib_cam_to_cam.txt", replaced(b"P_rect_03", b"Q"), "no row P_rect_03"),
     (TRACKING, CALIB, replaced(b"P2 ", b"P2 -"), "P2: no projection of a camera"),
-    (TRACKING, CALIB, replaced(b"Tr_velo_cam", b"x"), "no row Tr_velo_cam or Tr_velo_to_cam"),
-    (TRACKING, LABELS, replaced(b" Car ", b" Car x "), "words of a label"),
     (TRACKING, LABELS, lambda _: b"0 ../x Car" + b" 1" * 14, "words of a label"),
-    (TRACKING, LABELS, lambda _: b"0 3 Car" + b" 0" * 14, "the box measures 0 x 0 x 0 m"),
-    (TRACKING, "training/oxts/0007.txt", lambda _: b"\n", "no packet, expected one"),
 ]
 
 
@@ -76,11 +65,3 @@ def test_senseless_file(sound, tmp_path, name, pattern, change, expected):
     file = next(log.root.glob(f"**/{pattern}"))
     file.write_bytes(change(file.read_bytes()))
     assert expected in refusal(log, tmp_path / "store")
-
-
-def test_drive_without_cameras_that_are_read(sound, tmp_path):
-    log = sound[RAW].copied(tmp_path / "log")
-    for name in ("image_02", "image_03"):
-        folder = next(log.root.glob(f"*/*/{name}"))
-        folder.rename(folder.with_name(name.replace("2", "0").replace("3", "1")))
-    refusal(log, tmp_path / "store")

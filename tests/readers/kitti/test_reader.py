@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_log import DRIVE, SEQUENCE, write_kitti_raw
+from kitti_log import DRIVE, write_kitti_raw
 from nuscenes_log import reduced
 from scene_differences import scene_differences
 from written_logs import WRITERS
@@ -85,11 +85,3 @@ def test_real_drive_comes_back_from_a_raw_folder(tmp_path):
         for a, b in zip(real.views, scene.views, strict=True)
     ]
     assert np.mean(apart) < 2
-
-
-def test_one_camera_is_read_alone(read, tmp_path):
-    log, _, scene = read("kitti, tracking")
-    part = log.read(tmp_path, cameras=("image_03",))
-    assert part.camera_names == ("image_03",)
-    assert log.sequence == SEQUENCE
-    assert part.frame_indices == scene.frame_indices

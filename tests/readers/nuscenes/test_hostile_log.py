@@ -34,46 +34,27 @@ def set_sweep(key, value):
     return change
 
 
-NAN, ENDLESS = float("nan"), 10**400
+NAN = float("nan")
 CASES = [
     ("sample_data", set_in("ego_pose_token", "f" * 32), "refers to token 'fff"),
-    ("sample_data", set_in("calibrated_sensor_token", "f" * 32), "refers to token 'fff"),
     ("sample_annotation", set_in("instance_token", "gone"), "refers to token 'gone'"),
     ("ego_pose", lambda rows: rows + rows[:1], "stands in 2 rows"),
-    ("scene", lambda rows: rows + rows[:1], "name 'scene-0061' stands in 2 rows"),
     ("sample_data", lambda rows: rows + rows[:1], "has another row of the same time"),
     ("sample_annotation", lambda rows: rows + rows[:1], "has another box of instance"),
-    ("sample", lambda rows: rows[:1], "states 2 samples"),
     ("scene", set_in("nbr_samples", 0), "states 0 samples"),
     ("sample", set_in("timestamp", -5), "timestamp is -5, expected whole microseconds"),
-    ("sample", set_in("timestamp", True), "timestamp is True, expected whole microseconds"),
-    ("sample", set_in("timestamp", 2**62), "expected whole microseconds"),
     ("ego_pose", set_in("translation", [NAN, 0, 0]), "translation is [nan, 0, 0], expected 3"),
-    ("ego_pose", set_in("translation", [ENDLESS, 0, 0]), "expected 3 finite numbers"),
-    ("ego_pose", set_in("translation", [1, 2]), "translation is [1, 2], expected 3 finite"),
     ("ego_pose", set_in("rotation", [0, 0, 0, 0]), "expected a unit quaternion"),
-    ("ego_pose", set_in("rotation", "upright"), "rotation is 'upright', expected 4 finite"),
     ("sample_annotation", set_in("size", [1, 0, 1]), "expected positive sizes"),
-    ("sample_annotation", set_in("size", None), "size is None, expected 3 finite numbers"),
-    ("instance", set_in("token", "../x"), "refers to token"),
-    ("category", set_in("name", ""), "name is '', expected a text"),
     ("calibrated_sensor", set_in("camera_intrinsic", [], 2), "expected 3 x 3 finite numbers"),
-    ("calibrated_sensor", set_in("camera_intrinsic", [[1, 0, 1]] * 3, 2), "and no skew"),
     ("sample_data", set_in("filename", "../../../etc/passwd"), "expected a path below the root"),
-    ("sample_data", set_in("filename", "/etc/passwd"), "expected a path below the root"),
-    ("sample_data", set_in("filename", "a\x00b"), "expected a path below the root"),
     ("sample_data", set_in("filename", "\ud800"), "expected a path below the root"),
     ("sample_data", set_in("filename", "x" * 5000), "cannot be read (File name too long)"),
-    ("sample_data", set_in("filename", "samples"), "/log/samples: "),
-    ("sample_data", set_in("filename", "samples/none.jpg"), "none.jpg: the file is missing"),
     ("sample_data", set_in("is_key_frame", "yes"), "is_key_frame is 'yes', expected true or"),
     ("sample_data", set_in("width", 97), "the image is 96 x 54 px, expected 97 x 54"),
-    ("sample_data", set_in("width", -1), "width is -1, expected a count"),
     ("sample_data", set_sweep("is_key_frame", False), "no key frame of LIDAR_TOP"),
-    ("sensor", set_in("channel", ["LIDAR_TOP"]), "channel is ['LIDAR_TOP'], expected a text"),
     ("sample_data", lambda _: {"rows": 1}, "byte 0: expected '['"),
     ("sample_data", lambda _: [1, 2], "byte 1: an entry of the array is no row, expected [{"),
-    ("sample_data", lambda _: [{"token": 3}], "row 0: sample_token is no text but None"),
 ]
 
 
@@ -90,24 +71,6 @@ def test_instance_that_is_no_name(log, store):
     log.edit("sample_annotation", lambda rows: [{**rows[0], "instance_token": "../../x"}])
     message = refusal(log, store)
     assert "instance.json, token '../../x': actor name '../../x' cannot be used" in message
-
-
-def test_two_samples_at_one_time(log, store):
-    when = log.rows("sample")[0]["timestamp"]
-    log.edit("sample", set_in("timestamp", when, 1))
-    assert "another sample of the scene has the same time" in refusal(log, store)
-
-
-def test_two_key_sweeps_of_one_sample(log, store):
-    second = log.rows_of("LIDAR_TOP")[1]
-
-    def change(rows):
-        for row in rows:
-            if row["token"] == second["token"]:
-                row["is_key_frame"] = True
-
-    log.edit("sample_data", change)
-    assert "another key frame of LIDAR_TOP" in refusal(log, store)
 
 
 @pytest.mark.parametrize("content", ['[{"token": "a", "name"', "[{]", "[nothing]"])
@@ -128,15 +91,6 @@ def test_table_that_never_ends(log, store):
     assert refusal(log, store).endswith("category.json: not a file")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_truncated_table(log, store, share):
-    path = log.folder / "ego_pose.json"
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    message = refusal(log, store)
-    assert "ego_pose.json, byte " in message
-
-
 def sweep_file(log):
     return log.root / log.rows_of("LIDAR_TOP")[1]["filename"]
 
@@ -147,7 +101,7 @@ def write_points(file, change):
     file.write_bytes(rows.tobytes())
 
 
-@pytest.mark.parametrize("kept", [1, 19, 21, -1, -19])
+@pytest.mark.parametrize("kept", [1, -1])
 def test_truncated_sweep(log, store, kept):
     file = sweep_file(log)
     file.write_bytes(file.read_bytes()[:kept])
@@ -162,26 +116,11 @@ def test_sweep_of_more_than_a_turn(log, store, monkeypatch):
     assert message.endswith(": more than 100 bytes, expected one turn of a LiDAR")
 
 
-def test_empty_sweep(log, store):
-    sweep_file(log).write_bytes(b"")
-    assert "zero points beyond 1.0 m, expected at least one" in refusal(log, store)
-
-
-@pytest.mark.parametrize(("column", "value"), [(0, np.nan), (3, np.inf), (4, -np.inf)])
-def test_sweep_of_no_numbers(log, store, column, value):
-    def change(rows):
-        rows[7, column] = value
-
-    write_points(sweep_file(log), change)
-    assert "point 7: holds something other than finite numbers" in refusal(log, store)
-
-
 @pytest.mark.parametrize(
     ("column", "value", "expected"),
     [
+        (0, np.nan, "point 7: holds something other than finite numbers"),
         (4, 0.5, "point 7: ring 0.5 is no laser"),
-        (4, -1, "point 7: ring -1.0 is no laser"),
-        (4, 1e9, "is no laser"),
         (0, 3e38, "point 7: 3e+38 m from the sensor"),
     ],
 )
@@ -222,12 +161,6 @@ def test_damaged_table_names_the_place(tmp_path, content):
     path.write_text(content, "utf-8")
     with pytest.raises(DataError, match=r"rows\.json, (byte|row) \d+: "):
         NuscenesTable(path)
-
-
-def test_table_of_no_rows_is_empty(tmp_path):
-    (tmp_path / "rows.json").write_text(" [\n] ")
-    assert len(NuscenesTable(tmp_path / "rows.json")) == 0
-    assert NuscenesTable(tmp_path / "rows.json").rows_with("a") == []
 
 
 def test_row_that_is_not_utf8_is_refused_when_read(tmp_path):

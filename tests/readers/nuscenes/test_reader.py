@@ -6,16 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from nuscenes_log import SCENE_NAME, write_nuscenes_log
 
 from lidarpainter_models.readers import ingest_scene, list_sequences
 from lidarpainter_models.readers.nuscenes import dataset as nuscenes_dataset
-from lidarpainter_models.readers.nuscenes.sweeps import (
-    TURN_NS,
-    read_lidar_points,
-    turn_offset_ns,
-)
+from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, read_lidar_points, turn_offset_ns
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
@@ -54,14 +49,6 @@ def test_times_of_a_scene_lie_within_the_turn(read_street):
         assert offset_ns.abs().max() <= TURN_NS // 2
         frame = read_street.frame_position(sweep.frame_index)
         assert read_street.frame_timestamps_ns[frame] - sweep.timestamp_ns == TURN_NS // 2
-
-
-def test_world_begins_at_the_first_ego_pose_with_z_up(read_street):
-    first = read_street.world_from_ego[0]
-    assert first[:3, 3].norm() < 1e-9
-    assert abs(float(first[1, 0])) < 1e-9  # no turn to the left or right
-    up_global = read_street.global_from_world[:3, 2]
-    assert torch.allclose(up_global, torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-12)
 
 
 def test_boxes_end_with_the_last_key_frame(small_street, tmp_path):

@@ -1,19 +1,9 @@
 """A scene written as nuScenes and read back is the same scene."""
 
-import os
-import subprocess
-from pathlib import Path
-
-import numpy as np
-import pytest
 import torch
 from scene_differences import scene_differences
 
 from lidarpainter_models.checks.doctor import check_scene
-from lidarpainter_models.geometry.transforms import transform_points
-
-DEVKIT_ENVIRONMENT = "NUSCENES_DEVKIT_PYTHON"
-DEVKIT_READING = Path(__file__).parents[2] / "support" / "devkit_reading.py"
 
 
 def test_scene_comes_back_as_it_was(street, read_street):
@@ -50,34 +40,3 @@ def test_moving_is_what_travels(street, read_street):
         path_m = track.world_from_box[:, :3, 3] - track.world_from_box[0, :3, 3]
         assert track.is_moving == bool(path_m.norm(dim=1).max() >= 1.0)
     assert 3 <= sum(track.is_moving for track in read_street.tracks) < len(street.tracks) / 2
-
-
-@pytest.mark.slow
-def test_official_devkit_reads_the_same(street_log, read_street, tmp_path):
-    """Poses, lenses, points and boxes as the devkit computes them from the same tables."""
-    python = os.environ.get(DEVKIT_ENVIRONMENT)
-    if not python:
-        pytest.skip(f"{DEVKIT_ENVIRONMENT} names no Python that has nuscenes-devkit")
-    answers = tmp_path / "devkit.npz"
-    subprocess.run([python, DEVKIT_READING, street_log.root, answers], check=True, timeout=120)
-    devkit = dict(np.load(answers))
-    global_from_world = read_street.global_from_world
-    for view in read_street.views:
-        key = f"{view.timestamp_ns // 1000}/{view.camera_name}"
-        camera = view.camera
-        pose = devkit.pop(f"pose/{key}")
-        np.testing.assert_allclose(global_from_world @ camera.world_from_camera, pose, atol=1e-9)
-        lens = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
-        np.testing.assert_array_equal(lens, devkit.pop(f"lens/{key}"))
-    for position, frame_index in enumerate(read_street.frame_indices):
-        xyz_m = read_street.read_points(frame_index).xyz_m.double()
-        points = devkit.pop(f"points/{position}")
-        np.testing.assert_allclose(transform_points(global_from_world, xyz_m), points, atol=1e-4)
-    for track in read_street.tracks:
-        for row, position in enumerate(track.frame_indices.tolist()):
-            box = devkit.pop(f"box/{position}/{track.actor_id}")
-            pose = global_from_world @ track.world_from_box[row]
-            # between key frames the devkit leaves out that boxes are seen within the turn
-            np.testing.assert_allclose(pose, box[:16].reshape(4, 4), atol=1e-9 if box[19] else 1e-3)
-            np.testing.assert_allclose(track.size_m, box[16:19], atol=1e-6)
-    assert devkit == {}

@@ -7,10 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from parquet_footers import understate
-from waymo_edits import (
-    refused_line,
-    with_value,
-)
+from waymo_edits import refused_line, with_value
 from waymo_numbers import SEGMENT
 
 from lidarpainter_models.errors import DataError
@@ -25,9 +22,8 @@ def component_refusal(components, store, component, change):
     return refused_line(components, store, f"{component}/{SEGMENT}.parquet")
 
 
-@pytest.mark.parametrize("component", ["lidar_pose", "camera_image", "lidar_box"])
-def test_component_that_is_missing(components, tmp_path, component):
-    path = components.root / component / f"{SEGMENT}.parquet"
+def test_component_that_is_missing(components, tmp_path):
+    path = components.root / "lidar_box" / f"{SEGMENT}.parquet"
     path.unlink()
     line = refused_line(components, tmp_path / "store", str(path))
     assert line.endswith("the file is missing")
@@ -41,20 +37,9 @@ def test_column_that_is_missing(components, tmp_path):
     assert line.endswith(f"no column {name}")
 
 
-def test_frame_that_lacks_the_image_of_a_camera(components, tmp_path):
-    path = components.root / "camera_image" / f"{SEGMENT}.parquet"
-    pq.write_table(pq.read_table(path).take(pa.array([0, 1, 2])), path)
-    line = refused_line(components, tmp_path / "store", f"{SEGMENT}.parquet, row 1: no image of S")
-    expected = "no image of SIDE_LEFT, expected one of each camera; to read the others alone: "
-    assert line.endswith(f"{expected}--cameras FRONT")
-
-
 def test_rows_that_are_not_in_the_order_of_time(components, tmp_path):
     line = component_refusal(
-        components,
-        tmp_path / "store",
-        "lidar",
-        lambda table: table.take(pa.array([0, 2, 1, 3])),
+        components, tmp_path / "store", "lidar", lambda table: table.take(pa.array([0, 2, 1, 3]))
     )
     assert "row 2, key.frame_timestamp_micros: not in the order of time" in line
 
@@ -62,20 +47,12 @@ def test_rows_that_are_not_in_the_order_of_time(components, tmp_path):
 @pytest.mark.parametrize(
     ("component", "column", "value", "complaint"),
     [
-        ("lidar_box", "key.segment_context_name", "../x", "expected '1005081002024129653_5313"),
         ("camera_image", "key.segment_context_name", "other", "row 1, key.segment_context_name"),
         ("camera_image", "[CameraImageComponent].image", None, "row 1, .*image: is empty"),
-        ("camera_image", "[CameraImageComponent].image", b"GIF", "not a JPEG image"),
         ("camera_image", "key.camera_name", 99, "sensor 99 is not known"),
-        ("lidar", "key.laser_name", 0, "sensor 0 is not known"),
         ("lidar", "[LiDARComponent].range_image_return1.shape", [9, 9, 9], "expected at most"),
-        ("lidar", "[LiDARComponent].range_image_return2.values", [1.0], "4 bytes, expected"),
-        ("lidar_pose", "[LiDARPoseComponent].range_image_return1.shape", None, "shape"),
         ("vehicle_pose", "key.frame_timestamp_micros", -5, "expected a time since the epoch"),
-        ("lidar_box", "[LiDARBoxComponent].box.heading", float("nan"), "is not finite"),
         ("lidar_box", "key.laser_object_id", "../../x", "actor name"),
-        ("lidar_box", "key.laser_object_id", "x" * 257, "object_id: a text of 257 bytes, expected"),
-        ("camera_calibration", "[CameraCalibrationComponent].width", None, "width: is empty"),
         ("lidar_calibration", "[LiDARCalibrationComponent].beam_inclination.min", 9.0, "ascend|90"),
     ],
 )
@@ -98,7 +75,6 @@ def test_shape_that_is_no_number(size, axis):
 
 REPEATED = {
     "text": (pa.string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
-    "long text": (pa.large_string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
     "file": (pa.binary(), b"x" * 10_000, "column x is binary, expected numbers or texts"),
     "numbers": (pa.list_(pa.float64()), [0.0] * 1000, "1000 rows of 8000008 bytes, expected at"),
 }
@@ -148,16 +124,6 @@ def test_page_of_more_than_the_footer_says_is_refused_before_it_is_unpacked(
     finally:
         pa.set_memory_pool(usual)
     assert pool.max_memory() < 1 << 20
-
-
-def test_frame_that_stands_twice(components, tmp_path):
-    line = component_refusal(
-        components,
-        tmp_path / "store",
-        "vehicle_pose",
-        lambda table: table.take(pa.array([0, 1, 1])),
-    )
-    assert line.endswith("stands twice, expected once")
 
 
 def test_file_that_is_no_parquet(components, tmp_path):

@@ -11,11 +11,7 @@ from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 from tasks.ingest.data_checks import findings_about
 
 STREET = SyntheticStreetConfig(
-    seed=7,
-    num_frames=16,
-    width_px=480,
-    height_px=270,
-    speed_mps=(15.0, 15.0),
+    seed=7, num_frames=16, width_px=480, height_px=270, speed_mps=(15.0, 15.0)
 )
 FRONT, *SIDES = DEFAULT_CAMERAS
 SIDES_BY_NAME = [camera.name for camera in SIDES]

@@ -27,12 +27,7 @@ from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.painter.training_jobs import job_for, recipe_for
 from lidarpainter_models.training_data.pairs import PairSet
 from tasks.painter.evaluate import load_painting_scores, samples_path, score_held_back
-from tasks.painter.train import (
-    publish_painter,
-    train,
-    training_record,
-    weights_path,
-)
+from tasks.painter.train import publish_painter, train, training_record, weights_path
 from tasks.progress import listening
 
 CONFIG = OneStepTrainingConfig(

@@ -17,12 +17,7 @@ from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights
 from lidarpainter_models.training_data.pairs import PairSet
 from tasks.painter.evaluate import load_painting_scores, score_held_back, score_painters
-from tasks.painter.train import (
-    publish_painter,
-    train,
-    training_record,
-    weights_path,
-)
+from tasks.painter.train import publish_painter, train, training_record, weights_path
 from tasks.progress import listening
 
 CONFIG = NanoTrainingConfig(

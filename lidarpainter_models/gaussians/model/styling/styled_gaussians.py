@@ -110,12 +110,7 @@ class StyledGaussians:
         if key not in self._lit:
             self._lit.clear()
             self._lit[key] = styled_light(
-                self.gaussians,
-                self.sky,
-                self._traits,
-                self.style,
-                strengths,
-                self._lamp_light,
+                self.gaussians, self.sky, self._traits, self.style, strengths, self._lamp_light
             )
         return self._lit[key]
 

@@ -31,11 +31,7 @@ def add_vector(pointer, index, mask, vector):
 def load_pose(camera_from_body, body, mask):
     """Rotation rows and translation of bodies; those of masked lanes are zero."""
     start = camera_from_body + 16 * body.to(tl.int64)
-    rotation = (
-        _row(start, mask),
-        _row(start + 4, mask),
-        _row(start + 8, mask),
-    )
+    rotation = (_row(start, mask), _row(start + 4, mask), _row(start + 8, mask))
     translation = (
         tl.load(start + 3, mask=mask, other=0.0),
         tl.load(start + 7, mask=mask, other=0.0),
