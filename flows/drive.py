@@ -39,8 +39,10 @@ class DriveRequest:
     """Name of a built-in policy, or path of a Python file."""
     against: str | None = None
     """HOST:PORT of a renderer; None starts a server of one's own."""
+    start_s: float = 0.0
+    """When the drive begins, since the first image of the log."""
     seconds: float | None = None
-    """None drives as long as the log is."""
+    """None drives until the log ends."""
     lane_change_m: float = 0.0
     width_px: int = 480
     """Of the images that are asked for."""
@@ -69,7 +71,8 @@ def drive_run(store: Store, run: str, request: DriveRequest, out: Path) -> dict[
         lane_change_m=request.lane_change_m,
     )
     times_ns = [view.timestamp_ns for view in street.recorded.views]
-    start_ns, end_ns = max(int(loop.path.timestamps_ns[0]), min(times_ns)), max(times_ns)
+    start_ns = max(int(loop.path.timestamps_ns[0]), min(times_ns)) + round(request.start_s * 1e9)
+    end_ns = max(times_ns)
     seconds = _seconds(request, (end_ns - start_ns) * 1e-9)
     moments: list[Moment] = []
     with (
@@ -104,6 +107,10 @@ def drive_run(store: Store, run: str, request: DriveRequest, out: Path) -> dict[
 
 def _seconds(request: DriveRequest, longest_s: float) -> float:
     """How long is driven."""
+    if longest_s < LEAST_S:
+        raise ConfigError(
+            f"--start {request.start_s:g}: expected {LEAST_S:g} s before the log ends"
+        )
     if request.seconds is None:
         return STEP_S * int(longest_s / STEP_S + 1e-6)
     if not LEAST_S <= request.seconds <= longest_s + 1e-6:

@@ -34,6 +34,8 @@ _caught: list[int] = []
 """The signal that came first."""
 _started: list[int] = []
 """Descriptors of the processes that were there then: those that theirs leave behind end too."""
+_message = [MESSAGE]
+"""What a command says that is interrupted."""
 _actions: list[Callable[[], object]] = []
 """What `at_interruption` blocks enter, outermost first."""
 
@@ -65,6 +67,16 @@ def leave(code: int) -> NoReturn:
         with suppress(Exception):
             stream.flush()
     os._exit(code)
+
+
+def starts_anew(what: str) -> None:
+    """Let an interrupted command say that the same one does not go on, but begins something."""
+    _message[:] = [f"interrupted; the same command begins {what} anew"]
+
+
+def message() -> str:
+    """What the command says when it is interrupted."""
+    return _message[0]
 
 
 def is_interrupted() -> bool:
@@ -129,7 +141,7 @@ def _end_now(*, is_late: bool) -> NoReturn:
         with suppress(OSError):
             signal.pidfd_send_signal(process, signal.SIGKILL)
     with suppress(OSError):
-        line = f"{CLEAN_LINE if os.isatty(STDERR) else ''}lidarpainter: {MESSAGE}\n"
+        line = f"{CLEAN_LINE if os.isatty(STDERR) else ''}lidarpainter: {message()}\n"
         os.write(STDERR, line.encode())
     os._exit(128 + _caught[0])
 

@@ -5,7 +5,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -14,18 +14,18 @@ from catalog.store import Store
 from flows.lidar import learnt_channel
 from flows.parameters import view_parameters
 from flows.views import envelope_of, viewed_run
-from lidarpainter_models.devices import Device, chosen_device
+from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import WriteError
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.trajectory_words import RECORDED
-from lidarpainter_models.serving.http_server import http_server
+from lidarpainter_models.serving.http_routes import http_server
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.scene_pool import LoadedScene, ScenePool
 from lidarpainter_models.serving.server import grpc_server
 from lidarpainter_models.serving.servicer import SensorsimServicer, Told
 from tasks.runs import FinishedRun, open_run
-from tasks.serving.load import load_served
+from tasks.serving.load import ServedAs, load_served
 
 COLUMNS = (
     "scene",
@@ -54,14 +54,9 @@ class ServeRequest:
     """Of gRPC."""
     http_port: int | None = None
     """Of NeuroNCAP's routes, which show the first run; None leaves them out."""
-    is_painted: bool = False
-    painter: str | None = None
-    """Name of the painter; None takes each run's own."""
-    is_measured: bool = True
-    """Whether the confidence of every image is measured."""
+    how: ServedAs = field(default_factory=ServedAs)
     has_lidar: bool = False
     """Whether sweeps are answered; what the LiDAR of each log sees is learnt when it is loaded."""
-    device: Device = "auto"
     most_bytes: int = 4_000_000_000
     """Of scenes in memory."""
     most_waiting: int = 32
@@ -100,8 +95,8 @@ def serve_runs(
             tell=tell,
             shut_down_asked=stopped.set if request.allows_shut_down else None,
             config=_config(request),
-            device=chosen_device(request.device),
-            is_painted=request.is_painted,
+            device=chosen_device(request.how.device),
+            is_painted=request.how.is_painted,
         )
         address = None
         if request.http_port is not None:
@@ -151,16 +146,14 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
         run,
         ViewRequest(
             trajectory=parse_trajectory(RECORDED),
-            is_painted=request.is_painted,
-            painter=request.painter,
+            is_painted=request.how.is_painted,
+            painter=request.how.painter,
         ),
     )
     return load_served(
         viewed,
         envelope_of(store, run),
-        device=request.device,
-        is_painted=request.is_painted,
-        is_measured=request.is_measured,
+        request.how,
         lidar=_lidar_of(store, run) if request.has_lidar else None,
         name=run.run_id,
     )
@@ -168,8 +161,10 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
 
 def _config(request: ServeRequest) -> dict[str, str]:
     return {
-        "confidence": str(request.is_measured).lower(),
-        "painted": str(request.is_painted).lower(),
+        "confidence": str(request.how.is_measured).lower(),
+        "painted": str(request.how.is_painted).lower(),
+        "parked_apart": str(request.how.is_parked_apart).lower(),
+        "placeholders": str(request.how.has_placeholders).lower(),
         "memory_bytes": str(request.most_bytes),
         "queue": str(request.most_waiting),
         "time_limit_s": f"{request.limit_s:g}",

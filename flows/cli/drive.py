@@ -20,7 +20,8 @@ policy: Who drives: lane-keep (the middle of the lane), log (as recorded), idm (
   in radians.
 against: Renderer that is asked for the images, as HOST:PORT; a server of this run if absent.
 out: Folder that drive.mp4, the film, is written to.
-seconds: How long to drive; as long as the log is if absent.
+start: When to begin, in seconds of the log: the car is as fast then as the recording one was.
+seconds: How long to drive; until the log ends if absent.
 lane_change: Metres to the left of its line that the policy is to drive, after some seconds;
   negative is to the right.
 drive.width: Width of the images that are asked for, in pixels.
@@ -33,6 +34,7 @@ def drive(  # noqa: PLR0913 - the options of a command
     policy: Annotated[str, typer.Option()] = "lane-keep",
     against: str | None = None,
     out: Path = Path("drive"),
+    start: Annotated[float, typer.Option(min=0)] = 0.0,
     seconds: float | None = None,
     lane_change: float = 0.0,
     width: Annotated[int, typer.Option(min=32, max=4096)] = 480,
@@ -55,9 +57,16 @@ def drive(  # noqa: PLR0913 - the options of a command
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.drive import DriveRequest, drive_run
+    from flows.interruption import starts_anew
 
+    starts_anew("the drive")
     request = DriveRequest(
-        policy=policy, against=against, seconds=seconds, lane_change_m=lane_change, width_px=width
+        policy=policy,
+        against=against,
+        start_s=start,
+        seconds=seconds,
+        lane_change_m=lane_change,
+        width_px=width,
     )
     with shown_progress():
         result = drive_run(existing_store(), run_id, request, out.absolute())

@@ -42,7 +42,7 @@ from flows.cli import (
 )
 from flows.cli.output import Loudness, complain, loudness, set_loudness
 from flows.environment import keep_prefect_in, prepare_environment
-from flows.interruption import MESSAGE, Interrupted, is_interrupted
+from flows.interruption import Interrupted, is_interrupted, message
 from lidarpainter_models import __version__
 from lidarpainter_models.errors import ConfigError, LidarPainterError
 
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str]) -> int:
         return INTERRUPTED  # whoever answers signals says so, see `flows.interruption`
     except SystemExit as leaving:  # typer's way out of everything it knows, Ctrl-C included
         if leaving.code == INTERRUPTED:
-            complain(MESSAGE)
+            complain(message())
         return leaving.code if isinstance(leaving.code, int) else UNEXPECTED
     except (LidarPainterError, CatalogError) as error:
         _explain(error, str(error), is_debug=is_debug)

@@ -24,6 +24,9 @@ serve.port: Port of gRPC; 0 takes a free one.
 http_port: Port of NeuroNCAP's routes, which show the first run; without it there are none.
 paint: Paint every image, in agreement with the one that the same client asked of the camera before.
 serve.painter: Painter of the images, which it paints without --paint too; the run's own if absent.
+placeholder: Show an actor of the asset library for one that a scene does not have; else the request
+  is refused.
+parked_apart: Let clients move and leave out parked cars too, which else are part of the street.
 lidar: Answer LiDAR sweeps too; what the LiDAR of each log sees is learnt first, which takes minutes
   when it was not yet.
 memory: How much scenes in memory may take together, such as 4GB; the one that was asked for longest
@@ -46,6 +49,8 @@ def serve(  # noqa: PLR0913 - the options of a command
     http_port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     paint: bool = False,
     painter: str | None = None,
+    placeholder: bool = False,
+    parked_apart: bool = False,
     lidar: bool = False,
     device: str = "auto",
     memory: str = "4GB",
@@ -69,8 +74,11 @@ def serve(  # noqa: PLR0913 - the options of a command
     run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
     check_painter(painter)
     from catalog.store import existing_store
+    from flows.interruption import starts_anew
     from flows.serve import ServeRequest, serve_runs
+    from tasks.serving.load import ServedAs
 
+    starts_anew("the server")
     store = existing_store()
     if lidar:
         learn(store, run_ids)
@@ -81,11 +89,15 @@ def serve(  # noqa: PLR0913 - the options of a command
             host=host,
             port=port,
             http_port=http_port,
-            is_painted=paint or painter is not None,
-            painter=painter,
-            is_measured=trust,
+            how=ServedAs(
+                device=device,
+                is_painted=paint or painter is not None,
+                painter=painter,
+                is_measured=trust,
+                is_parked_apart=parked_apart,
+                has_placeholders=placeholder,
+            ),
             has_lidar=lidar,
-            device=device,
             most_bytes=most_bytes,
             most_waiting=queue,
             limit_s=limit_s,

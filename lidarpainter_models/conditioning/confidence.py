@@ -32,9 +32,10 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
-from lidarpainter_models.geometry.cameras import Camera, outside_all
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.backends import may_run_on_host
+from lidarpainter_models.lidar.points_in_view import READ_MARGIN
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 WARP_WEIGHT = 0.9  # support of a pixel that two recorded images show alike
@@ -47,6 +48,12 @@ LIDAR_REACH_RAD = 0.006
 """Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
 ALPHA_RANGE = (0.5, 0.95)  # opacity where a surface starts to count, and where it counts fully
 REACHES = 12  # times its reach beyond which LiDAR supports nothing: exp(-12)
+CAMERAS_AT_ONCE = 8
+"""Recorded cameras that are asked together, those first that are likeliest to have seen a view."""
+RIM = 1e-3
+"""Of half an image: so near its border rounding decides what is inside."""
+LIKENESS_M = 8.0
+"""So much farther a camera may stand that looks in the direction of a view, not across it."""
 NEAREST_M = 0.1  # nearer to a camera than this is nothing seen, as in `Camera.contains`
 MOST_PROJECTIONS = 2**24
 """Points times cameras projected in one go: a few hundred megabytes."""
@@ -70,11 +77,62 @@ def is_seen(
     Pixels without depth (0) are taken as sky: only their direction counts.
     """
     points_world = camera.unproject(torch.where(depth_m > 0, depth_m, SKY_DEPTH_M)).reshape(-1, 3)
+    cameras = list(recorded_cameras)
     if not may_run_on_host(depth_m.device):
-        return _in_any(points_world, list(recorded_cameras)).reshape(depth_m.shape)
-    seen = torch.ones_like(depth_m, dtype=torch.bool).reshape(-1)
-    seen[outside_all(points_world, recorded_cameras)] = False
-    return seen.reshape(depth_m.shape)
+        return _in_any(points_world, cameras).reshape(depth_m.shape)
+    pose = camera.world_from_camera.double()
+    poses = torch.stack([pose, *(one.world_from_camera.double() for one in cameras)])[1:]
+    likely = (poses[:, :3, 2] @ pose[:3, 2]) * LIKENESS_M
+    likely -= (poses[:, :3, 3] - pose[:3, 3]).norm(dim=1)
+    ordered = [cameras[row] for row in likely.argsort(descending=True).tolist()]
+    is_out = torch.ones(len(points_world), dtype=torch.bool)
+    on_rims: list[tuple[Camera, Tensor]] = []
+    for first in range(0, len(ordered), CAMERAS_AT_ONCE):
+        out = is_out.nonzero()[:, 0]
+        some = ordered[first : first + CAMERAS_AT_ONCE]
+        inside, near = _around_images(some, points_world[out])
+        is_out[out] = ~inside.any(dim=0)
+        rims = near & ~inside
+        on_rims += [(some[row], out[rims[row]]) for row in rims.any(dim=1).nonzero()[:, 0].tolist()]
+    for one, rows in on_rims:
+        left = rows[is_out[rows]]
+        is_out[left[one.contains(*one.project(points_world[left]))]] = False
+    return ~is_out.reshape(depth_m.shape)
+
+
+def _around_images(
+    cameras: Sequence[Camera], points_world: Float[Tensor, "points 3"]
+) -> tuple[Bool[Tensor, "cameras points"], Bool[Tensor, "cameras points"]]:
+    """Which points surely fall into the image of each camera, and which may.
+
+    In between lie those near the rim of the image: a rolling shutter may read them inside or not.
+    """
+    matrices, sizes = (each.to(points_world) for each in _projections(cameras))
+    across, down, depth_m = (matrices[:, :, :3] @ points_world.T + matrices[:, :, 3:]).unbind(1)
+    half = sizes / 2
+    aside = torch.maximum(
+        (across / depth_m - half[:, :1]).abs() / half[:, :1],
+        (down / depth_m - half[:, 1:]).abs() / half[:, 1:],
+    )
+    rolls = torch.tensor([one.shutter is not None and one.shutter.is_rolling for one in cameras])
+    margin = torch.where(rolls, 2 * READ_MARGIN, RIM)[:, None]
+    is_ahead = depth_m > NEAREST_M
+    return is_ahead & (aside < 1 - margin), is_ahead & (aside < 1 + margin)
+
+
+def _projections(
+    cameras: Sequence[Camera],
+) -> tuple[Float[Tensor, "cameras 3 4"], Float[Tensor, "cameras 2"]]:
+    """What takes points of the world to pixels times depth and depth, and sizes; float64."""
+    lens = torch.tensor(
+        [[[c.fx_px, 0, c.cx_px, 0], [0, c.fy_px, c.cy_px, 0], [0, 0, 1, 0]] for c in cameras],
+        dtype=torch.float64,
+    )
+    poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
+    sizes = torch.tensor(
+        [[camera.width_px, camera.height_px] for camera in cameras], dtype=torch.float64
+    )
+    return lens @ invert_rigid(poses), sizes
 
 
 def _in_any(
@@ -87,17 +145,7 @@ def _in_any(
     found = torch.zeros_like(points_world[:, 0], dtype=torch.bool)
     if not cameras:
         return found
-    lens = torch.tensor(
-        [
-            [[c.fx_px, 0, c.cx_px, 0], [0, c.fy_px, c.cy_px, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-            for c in cameras
-        ],
-        dtype=torch.float64,
-    )
-    poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
-    matrices = (lens @ invert_rigid(poses)).to(points_world, non_blocking=True)
-    sizes = torch.tensor([[camera.width_px, camera.height_px] for camera in cameras])
-    sizes = sizes.to(points_world, non_blocking=True)
+    matrices, sizes = (each.to(points_world, non_blocking=True) for each in _projections(cameras))
     each = max(1, MOST_PROJECTIONS // max(len(points_world), 1))
     for matrix, size in zip(matrices.split(each), sizes.split(each), strict=True):
         u, v, depth_m = (points_world @ matrix[:, :3, :3].mT + matrix[:, None, :3, 3]).unbind(-1)

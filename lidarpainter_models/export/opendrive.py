@@ -2,8 +2,7 @@
 
 World frame, z up, metres: x and y of the file are those of the world. One road without junctions:
 its reference line is where traffic against us begins (left of all lanes that go our way), in cubic
-pieces of Hermite; heights and crossfall come from the ground. What no marking told is named in
-`userData`.
+pieces of Hermite; its heights are those of the ground. What no marking told is named in `userData`.
 """
 
 import xml.etree.ElementTree as ET
@@ -20,9 +19,7 @@ from lidarpainter_models.lidar.road_lanes import Lane, Road
 PIECE_M = 5.0
 """A cubic piece so long is nearer than a millimetre to any line that a car can drive."""
 SMOOTH_PIECES = 1.0
-"""Deviation of the Gaussian over heights and crossfall, in pieces: a road has no steps."""
-ACROSS = 9
-"""Heights by which the crossfall is told at each end of a piece."""
+"""Deviation of the Gaussian over heights, in pieces: a road has no steps."""
 _MARK_WIDTH_M = 0.15
 
 
@@ -60,10 +57,9 @@ def opendrive(road: Road, ground: GroundSurface, name: str, said: Mapping[str, s
     element = _add(root, "road", name=name, length=starts_m[-1], id=1, junction=-1, rule="RHT")
     _add(_add(element, "type", s=0, type="town"), "speed", max="undefined")
     element.append(geometry)
-    heights_m, fall = _heights(road, ground, along_m, reference_d_m)
-    elevation = _add(element, "elevationProfile")
-    _add_cubics(elevation, "elevation", starts_m, heights_m)
-    _add_cubics(_add(element, "lateralProfile"), "superelevation", starts_m, np.arctan(fall))
+    known_m = ground.everywhere().at(road.line.place(along_m, reference_d_m))
+    heights_m = gaussian_filter1d(known_m, SMOOTH_PIECES, mode="nearest")
+    _add_heights(_add(element, "elevationProfile"), starts_m, heights_m)
     section = _add(_add(element, "lanes"), "laneSection", s=0)
     left = [(n + 1, lane) for n, lane in enumerate(road.lanes[split:])]
     _add_lanes(section, "left", left[::-1], "left_mark")
@@ -111,28 +107,6 @@ def _geometry(
     return plan, np.array(starts_m)
 
 
-def _heights(
-    road: Road, ground: GroundSurface, along_m: Float[np.ndarray, " ends"], d_m: float
-) -> tuple[Float[np.ndarray, " ends"], Float[np.ndarray, " ends"]]:
-    """Height of the reference line and how much the road rises to its left, end by end."""
-    aside_m = np.linspace(road.lanes[0].right_d_m, road.lanes[-1].left_d_m, ACROSS) - d_m
-    z = ground.at(road.line.place(along_m[:, None], d_m + aside_m[None]))
-    known, weight = np.nan_to_num(z), np.isfinite(z).astype(float)
-    count = weight.sum(axis=1)
-    mean_m = (weight * aside_m).sum(axis=1) / np.maximum(count, 1)
-    mean_z = (weight * known).sum(axis=1) / np.maximum(count, 1)
-    off = weight * (aside_m - mean_m[:, None])
-    fall = (off * known).sum(axis=1) / np.maximum((off * off).sum(axis=1), 1e-9)
-    told = count >= 3
-    if not told.any():
-        return np.zeros(len(along_m)), np.zeros(len(along_m))
-    heights = [
-        np.interp(along_m, along_m[told], one[told]) for one in (mean_z - fall * mean_m, fall)
-    ]
-    smooth = [gaussian_filter1d(one, SMOOTH_PIECES, mode="nearest") for one in heights]
-    return smooth[0], smooth[1]
-
-
 def _add_lanes(
     section: ET.Element, side: str, lanes: list[tuple[int, Lane]], outer_mark: str
 ) -> None:
@@ -161,20 +135,18 @@ def _add_mark(lane: ET.Element, mark: str) -> None:
     )
 
 
-def _add_cubics(
+def _add_heights(
     parent: ET.Element,
-    tag: str,
     starts_m: Float[np.ndarray, " ends"],
-    values: Float[np.ndarray, " ends"],
+    heights_m: Float[np.ndarray, " ends"],
 ) -> None:
-    """A profile through values at the ends of the pieces, with continuous slope."""
-    slope = np.gradient(values, starts_m)
-    for number, start_m in enumerate(starts_m[:-1]):
-        length_m = starts_m[number + 1] - start_m
-        rise = (values[number + 1] - values[number]) / length_m
-        b, last = slope[number], slope[number + 1]
+    """A profile through heights at the ends of the pieces, with continuous slope."""
+    slope = np.gradient(heights_m, starts_m)
+    for number, length_m in enumerate(np.diff(starts_m)):
+        a, b, last = heights_m[number], slope[number], slope[number + 1]
+        rise = (heights_m[number + 1] - a) / length_m
         c, d = (3 * rise - 2 * b - last) / length_m, (b + last - 2 * rise) / length_m**2
-        _add(parent, tag, s=start_m, a=values[number], b=b, c=c, d=d)
+        _add(parent, "elevation", s=starts_m[number], a=a, b=b, c=c, d=d)
 
 
 def _add(parent: ET.Element, tag: str, **values: float | str) -> ET.Element:

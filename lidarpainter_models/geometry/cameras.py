@@ -6,7 +6,7 @@ point projects to u = fx x / z + cx with cx measured from the image's left edge.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import hypot, isfinite
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -172,6 +172,20 @@ class Camera:
         u, v = pixels_uv.unbind(-1)
         inside = (u >= 0) & (u < self.width_px) & (v >= 0) & (v < self.height_px)
         return inside & (depth_m > near_m)
+
+    def may_see(self, centre_world: Float[Tensor, "3"], radius_m: float) -> bool:
+        """Whether any part of a ball can fall into the image; false where surely none does."""
+        seen_from = self.camera_from_world
+        x, y, z = (seen_from[:3, :3] @ centre_world.double() + seen_from[:3, 3]).tolist()
+        right_px, below_px = self.width_px - self.cx_px, self.height_px - self.cy_px
+        inside_m = (
+            z,
+            (x * self.fx_px + z * self.cx_px) / hypot(self.fx_px, self.cx_px),
+            (z * right_px - x * self.fx_px) / hypot(self.fx_px, right_px),
+            (y * self.fy_px + z * self.cy_px) / hypot(self.fy_px, self.cy_px),
+            (z * below_px - y * self.fy_px) / hypot(self.fy_px, below_px),
+        )
+        return min(inside_m) > -radius_m - 1e-3
 
     def pixel_directions(
         self, device: torch.device | None = None

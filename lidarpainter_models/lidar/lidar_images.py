@@ -62,8 +62,6 @@ class LidarImage:
     """Camera z of the surface hit, coloured or not; 0 = none."""
     hit: Bool[Tensor, "height width"]
     """Where a coloured point gave `rgb`."""
-    age_s: Float[Tensor, "height width"]
-    """Mean time between the image and the points in a pixel; 0 where none hits."""
 
 
 class ViewPoints(NamedTuple):
@@ -88,6 +86,8 @@ class ViewPoints(NamedTuple):
     @classmethod
     def concatenate(cls, parts: Sequence["ViewPoints"]) -> "ViewPoints":
         """All points of several parts, in their order."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -108,18 +108,16 @@ def render_lidar(
         rgb=torch.where(hit[..., None], image[..., :3] / image[..., 3:4], 0),
         depth_m=image[..., 4],
         hit=hit,
-        age_s=image[..., 5],
     )
 
 
 def _image(
     recent: ViewPoints, older: ViewPoints, camera: Camera, reach_px: int
-) -> Float[Tensor, "height width 6"]:
+) -> Float[Tensor, "height width 5"]:
     """Recent points first, older ones where those leave the image open, then gaps closed."""
     surface = _surface(recent, camera, recent.radius_px.round())
     recent = recent.without(_hidden(recent, surface, reach_px))
-    everywhere = torch.ones_like(surface, dtype=torch.bool)
-    image = _blend(recent, everywhere, camera)
+    image = _blend(recent, torch.ones_like(surface, dtype=torch.bool), camera)
     is_open = image[..., 4] == 0
     older = older.keep(_at(spread(is_open, reach_px), older))
     surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
@@ -143,8 +141,10 @@ def _points_around(
     street = where(lidar_map.street, world, stand_still=True)
     recent = [street.points(street.age_ns <= window_ns)]
     older = street.points((street.age_ns > window_ns) & (street.age_ns <= reach_ns))
+    image = with_margin(camera, margin_px, margin_px)
     for track, world_from_box in actors.placed(timestamp_ns):
-        if (points := lidar_map.actors.get(track.actor_id)) is not None:
+        points = lidar_map.actors.get(track.actor_id)
+        if points is not None and image.may_see(world_from_box[:3, 3], points.reach_m):
             actor = where(points, world_from_box, stand_still=False)
             recent.append(actor.points(torch.ones_like(actor.age_ns, dtype=torch.bool)))
     return ViewPoints.concatenate(recent), older
@@ -210,7 +210,7 @@ def _hidden(
 
 def _blend(
     points: ViewPoints, wanted: Bool[Tensor, "height width"], camera: Camera
-) -> Float[Tensor, "height width 6"]:
+) -> Float[Tensor, "height width 5"]:
     """Mean of the points on the surface of each wanted pixel: the columns of `_means_on`."""
     direct = _surface(points, camera, torch.zeros_like(points.radius_px))
     covered = _surface(points, camera, points.radius_px.ceil())
@@ -220,7 +220,7 @@ def _blend(
 
 def _fill_gaps(
     depth_m: Float[Tensor, "height width"], parts: Sequence[ViewPoints], camera: Camera
-) -> Float[Tensor, "height width 6"]:
+) -> Float[Tensor, "height width 5"]:
     """What wider discs give in the gaps of a surface; 0 elsewhere."""
     reach_px = math.ceil(GAP_WIDENING * MAX_RADIUS_RAD * camera.fx_px)
     gaps = surface_gaps(depth_m, reach_px)
@@ -256,13 +256,14 @@ def _at(image: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Ten
 
 def _means_on(
     surface_depth_m: Float[Tensor, "height width"], points: ViewPoints
-) -> Float[Tensor, "height width 6"]:
-    """Means of coloured rgb, share of coloured points, depth and age on a surface; 0 off it."""
+) -> Float[Tensor, "height width 5"]:
+    """Means of coloured rgb, share of coloured points and depth on a surface; 0 off it."""
     newest_s = points.age_s.min() if len(points.age_s) else 0.0
+    points = points.keep(_touches(surface_depth_m, points))  # few do: columns are made of these
     recent = torch.exp(-(points.age_s - newest_s) / RECENCY_S).clamp(min=1e-6)
     coloured = points.has_colour.to(torch.float32)[:, None]
     rgb = points.rgb_u8.to(torch.float32) / 255 * coloured
-    columns = [rgb, coloured, points.depth_m[:, None], points.age_s[:, None]]
+    columns = [rgb, coloured, points.depth_m[:, None]]
     image, _ = blend_points(
         points.positions_uv,
         points.depth_m,
@@ -273,6 +274,21 @@ def _means_on(
         tolerance=SURFACE_TOLERANCE,
     )
     return image
+
+
+def _touches(
+    surface_depth_m: Float[Tensor, "height width"], points: ViewPoints
+) -> Bool[Tensor, " points"]:
+    """Which points may lie on the surface of a pixel that they reach, and some more."""
+    reach_px = math.ceil(float(points.radius_px.max())) if len(points.radius_px) else 0
+    nearness = torch.where(surface_depth_m > 0, 1 / surface_depth_m, 0)  # 0 where there is none
+    farness = torch.where(surface_depth_m > 0, surface_depth_m, 0)
+    most, farthest_m = torch.nn.functional.max_pool2d(
+        torch.stack([nearness, farness]), 2 * reach_px + 1, 1, reach_px
+    )
+    slack = 1 + SURFACE_TOLERANCE / (1 - SURFACE_TOLERANCE) + 1e-4  # of rounding
+    is_near = points.depth_m <= slack * _at(farthest_m, points)
+    return is_near & (points.depth_m * _at(most, points) * slack >= 1)
 
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))

@@ -36,6 +36,11 @@ class MapPoints:
         """How many points there are."""
         return self.xyz_m.shape[0]
 
+    @cached_property
+    def reach_m(self) -> float:
+        """How far the farthest point is from the origin of their frame."""
+        return float(self.xyz_m.norm(dim=1).max()) if len(self) else 0.0
+
     def keep(self, kept: Tensor | slice) -> "MapPoints":
         """The points marked or listed; of a slice nothing is copied."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})

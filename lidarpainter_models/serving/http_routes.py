@@ -2,32 +2,38 @@
 
 Camera poses are OpenCV's (x right, y down, z forward), actor poses the centres of boxes; times are
 microseconds. Nothing rolls. Actors stand where the client last put them; those that it left out are
-gone. The routes know one scene.
+gone. The routes know one scene, which is loaded when it is first asked for.
 """
 
 import base64
 import io
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from threading import Lock
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.errors import ConfigError, LidarPainterError
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track, is_rigid
 from lidarpainter_models.serving.image_formats import Encoding, encoded
 from lidarpainter_models.serving.messages import SensorRequest
 from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.renderer import Frame, ServedScene
-from lidarpainter_models.serving.sensor_cameras import PinholeLens, SensorCamera
+from lidarpainter_models.serving.sensor_cameras import SensorCamera
 from lidarpainter_models.serving.trust import metadata
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
+END_S = 1.0
+"""How long the server may take to end."""
 MOST_ACTORS, MOST_POSES = 1000, 10_000
 STATUS = {"NOT_FOUND": 404, "OUT_OF_RANGE": 416, "RESOURCE_EXHAUSTED": 429, "UNAVAILABLE": 503}
 """HTTP's for codes of refusals; 422 for all others."""
@@ -67,29 +73,44 @@ class ImageMessage(BaseModel):
 class HttpScene:
     """The scene of the routes, and where its actors are by now."""
 
-    served: ServedScene
+    scene: Callable[[], ServedScene]
     queue: RenderQueue
     _scales: dict[str, float] = field(default_factory=dict, init=False)
-    _actors: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False)
-    _lock: Lock = field(default_factory=Lock, init=False)
+    _lock: threading.RLock = field(default_factory=threading.RLock, init=False)
 
-    def __post_init__(self) -> None:
-        """Everybody is where it was recorded."""
-        for track in self.served.scene.tracks:
-            self._actors[track.actor_id] = (track.timestamps_ns // 1000, track.world_from_box)
+    @property
+    def served(self) -> ServedScene:
+        """The scene, with its actors as large as the client has them."""
+        with self._lock:
+            return self._served
+
+    @cached_property
+    def _served(self) -> ServedScene:
+        return self.scene()
+
+    @cached_property
+    def _actors(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Times (microseconds) and poses by id; at first as recorded."""
+        tracks = self.served.scene.tracks
+        return {one.actor_id: (one.timestamps_ns // 1000, one.world_from_box) for one in tracks}
+
+    def start_us(self) -> int:
+        """When the recording begins."""
+        return int(self.served.recorded.frame_timestamps_ns[0]) // 1000
 
     def actors(self) -> list[dict[str, Any]]:
         """Where actors are, as the client asks for it."""
         sizes = {track.actor_id: track.size_m.tolist() for track in self.served.scene.tracks}
-        return [
-            {
-                "uuid": name,
-                "poses": poses.tolist(),
-                "timestamps": times_us.tolist(),
-                "dims": sizes[name],
-            }
-            for name, (times_us, poses) in self._actors.items()
-        ]
+        with self._lock:
+            return [
+                {
+                    "uuid": name,
+                    "poses": poses.tolist(),
+                    "timestamps": times_us.tolist(),
+                    "dims": sizes[name],
+                }
+                for name, (times_us, poses) in self._actors.items()
+            ]
 
     def update(self, actors: list[ActorMessage]) -> None:
         """Put the actors where the client has them.
@@ -97,12 +118,9 @@ class HttpScene:
         Raises:
             RequestError: INVALID_ARGUMENT: a stranger, or poses that are none.
         """
-        known = {track.actor_id for track in self.served.scene.tracks}
-        found = {}
         for actor in actors:
-            if actor.uuid not in known:
-                raise invalid(f"actor {actor.uuid!r}: the scene has no such actor")
-            found[actor.uuid] = _track_of(actor)
+            self._body_of(actor.uuid)
+        found = {actor.uuid: _track_of(actor) for actor in actors}
         with self._lock:
             self._actors = found
 
@@ -112,24 +130,25 @@ class HttpScene:
         Raises:
             RequestError: INVALID_ARGUMENT: the scene has no such actor.
         """
-        scene = self.served.scene
-        bodies = {t.actor_id: body for body, t in enumerate(scene.actors.recorded_tracks, start=1)}
-        if message.uuid not in bodies:
-            raise invalid(f"actor {message.uuid!r}: the scene has no such actor")
+        body = self._body_of(message.uuid)
         with self._lock:
+            scene = self.served.scene
             change = message.scale / self._scales.get(message.uuid, 1.0)
             self._scales[message.uuid] = message.scale
-            rows = scene.gaussians.body_index == bodies[message.uuid]
-            factor = torch.where(rows, change, 1.0).to(scene.device)[:, None]
+            factor = torch.where(scene.gaussians.body_index == body, change, 1.0)[:, None]
             larger = replace(
                 scene.gaussians,
                 means=scene.gaussians.means * factor,
                 log_scale=scene.gaussians.log_scale + factor.log(),
             )
-            builder = self.served.builder.showing(
-                scene.with_gaussians(larger), self.served.builder.boxes
-            )
-            self.served = replace(self.served, builder=builder)
+            self._served = self._served.showing(scene.with_gaussians(larger))
+
+    def _body_of(self, name: str) -> int:
+        """Which body of the scene an actor is."""
+        for body, track in enumerate(self.served.scene.actors.recorded_tracks, start=1):
+            if track.actor_id == name:
+                return body
+        raise invalid(f"actor {name!r}: the scene has no such actor")
 
     def frame(self, message: ImageMessage) -> Frame:
         """The image that a client asks for, at the size of the fit.
@@ -137,9 +156,8 @@ class HttpScene:
         Raises:
             RequestError: no such camera, a time outside of the scene, or a pose that is none.
         """
-        request = self._request(message)
-        key = ("http", id(self.served), message.model_dump_json(), id(self._actors))
-        served = self.served
+        served, request = self.served, self._request(message)
+        key = ("http", id(served), message.model_dump_json(), id(self._actors))
         return self.queue.answer(key, lambda: served.frame(request, "http"))
 
     def _request(self, message: ImageMessage) -> SensorRequest:
@@ -151,7 +169,6 @@ class HttpScene:
                 f"{', '.join(served.recorded.camera_names)}",
             )
         view = served.recorded.views_of(message.camera_name)[0]
-        lens = view.camera.no_wider(served.observation.width_px)
         time_us = message.timestamp
         with self._lock:
             ids = [n for n, (times, _) in self._actors.items() if _is_there(times, time_us)]
@@ -160,13 +177,7 @@ class HttpScene:
         return SensorRequest(
             scene_id=served.scene_id,
             camera_name=message.camera_name,
-            camera=SensorCamera(
-                lens=PinholeLens(),
-                pixels_per_unit=(lens.fx_px, 0.0, 0.0, lens.fy_px),
-                middle_px=(lens.cx_px, lens.cy_px),
-                width_px=lens.width_px,
-                height_px=lens.height_px,
-            ),
+            camera=SensorCamera.of_pinhole(view.camera.no_wider(served.observation.width_px)),
             start_us=time_us,
             end_us=time_us,
             world_from_sensor=torch.stack([pose, pose]),
@@ -217,8 +228,7 @@ def http_app(scene: HttpScene) -> "FastAPI":
         return JSONResponse({"detail": str(error)}, STATUS.get(code, 422))
 
     app.get("/alive")(lambda: True)
-    first_ns = int(scene.served.recorded.frame_timestamps_ns[0])
-    app.get("/start_time")(lambda: first_ns // 1000)
+    app.get("/start_time")(scene.start_us)
     app.get("/get_actors")(scene.actors)
 
     @app.post("/update_actors")
@@ -242,3 +252,34 @@ def http_app(scene: HttpScene) -> "FastAPI":
         return Response(data, media_type=f"image/{kind}", headers=headers)
 
     return app
+
+
+@contextmanager
+def http_server(
+    scene: Callable[[], ServedScene], queue: RenderQueue, *, host: str, port: int
+) -> Iterator[int]:
+    """Serve as long as the block runs; gives the port, which 0 leaves to the system.
+
+    Raises:
+        ConfigError: the port cannot be had.
+    """
+    import uvicorn
+
+    try:
+        listening = socket.create_server((host, port))
+    except OSError:
+        raise ConfigError(
+            f"port {port} of {host} cannot be had: it is in use or not allowed"
+        ) from None
+    app = http_app(HttpScene(scene=scene, queue=queue))
+    config = uvicorn.Config(app, log_level="critical", lifespan="off", timeout_graceful_shutdown=0)
+    server = uvicorn.Server(config)
+    sockets = {"sockets": [listening]}
+    thread = threading.Thread(target=server.run, kwargs=sockets, name="http", daemon=True)
+    thread.start()
+    try:
+        yield listening.getsockname()[1]
+    finally:
+        server.should_exit = True
+        thread.join(END_S)
+        listening.close()

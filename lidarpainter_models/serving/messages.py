@@ -7,10 +7,11 @@ what makes no sense is refused in one line that names the field.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -21,7 +22,7 @@ from lidarpainter_models.geometry.transforms import (
     rotation_from_quaternion,
 )
 from lidarpainter_models.serving.image_formats import Encoding, encoding_of
-from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.refusals import invalid
 from lidarpainter_models.serving.requested_lenses import checked_size, sensor_camera
 from lidarpainter_models.serving.sensor_cameras import SensorCamera
@@ -112,7 +113,7 @@ def middle_of(pairs: Float[Tensor, "bodies 2 4 4"]) -> Float[Tensor, "bodies 4 4
     return torch.where(stands[:, None, None], start, half)
 
 
-def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRequest
+def read_request(message: Message) -> SensorRequest:
     """What an `RGBRenderRequest` asks for.
 
     Raises:
@@ -138,7 +139,7 @@ def read_request(message: Any) -> SensorRequest:  # noqa: ANN401  an RGBRenderRe
     )
 
 
-def read_timed(message: Any) -> dict[str, Any]:  # noqa: ANN401  a request of any sensor
+def read_timed(message: Message) -> dict[str, Any]:
     """What every request says of its span of time: the fields of a `TimedRequest`.
 
     Raises:
@@ -169,7 +170,7 @@ def read_timed(message: Any) -> dict[str, Any]:  # noqa: ANN401  a request of an
     }
 
 
-def _own_body_of(message: Any) -> str | None:  # noqa: ANN401  an RGBRenderRequest
+def _own_body_of(message: Message) -> str | None:
     if not message.insert_ego_mask:
         return None
     return message.ego_mask_id.camera_logical_id or message.camera_intrinsics.logical_id
@@ -182,40 +183,60 @@ def _each_once(ids: tuple[str, ...]) -> tuple[str, ...]:
     return ids
 
 
-def _poses(pairs: Sequence[tuple[str, Any]]) -> Float[Tensor, "pairs 2 4 4"]:
+def _poses(pairs: Sequence[tuple[str, Message]]) -> Float[Tensor, "pairs 2 4 4"]:
     """Pairs of poses (`PosePair`); one without an end stays where it starts."""
-    rows = []
+    ends = []
     for what, pair in pairs:
         if not pair.HasField("start_pose"):
             raise invalid(f"{what} has no start_pose")
         end = pair.end_pose if pair.HasField("end_pose") else pair.start_pose
-        rows.append([_numbers(pair.start_pose), _numbers(end)])
-    found = torch.tensor(rows, dtype=torch.float64)
-    lengths = found[..., 3:].norm(dim=-1)
+        ends += [(what, pair.start_pose), (what, end)]
+    return _checked_poses(ends).unflatten(0, (len(pairs), 2))
+
+
+def track_poses(
+    trajectory: Message, what: str
+) -> tuple[Int[Tensor, " times"], Float[Tensor, "times 4 4"]]:
+    """Times (nanoseconds) and poses of a `Trajectory`.
+
+    Raises:
+        RequestError: INVALID_ARGUMENT: it has none, too many, or its times do not ascend.
+    """
+    times_us = [one.timestamp_us for one in trajectory.poses[: MOST_ACTORS + 1]]
+    is_rising = all(first < second for first, second in pairwise(times_us))
+    if not 0 < len(times_us) <= MOST_ACTORS or not is_rising or times_us[-1] >= 2**53:
+        raise invalid(f"{what}: expected a way of 1 to {MOST_ACTORS} poses at ascending times")
+    poses = _checked_poses([(what, one.pose) for one in trajectory.poses])
+    return torch.tensor(times_us) * 1000, poses
+
+
+def _checked_poses(named: Sequence[tuple[str, Message]]) -> Float[Tensor, "poses 4 4"]:
+    found = torch.tensor([_numbers(pose) for _, pose in named], dtype=torch.float64)
+    lengths = found[:, 3:].norm(dim=-1)
     is_good = found.isfinite().all(-1) & ((lengths - 1).abs() <= LENGTH_TOLERANCE)
-    is_good &= (found[..., :3].abs() <= FARTHEST_M).all(-1)
+    is_good &= (found[:, :3].abs() <= FARTHEST_M).all(-1)
     if not bool(is_good.all()):
-        row, end = (~is_good).nonzero()[0].tolist()
-        shown = ", ".join(f"{number:g}" for number in found[row, end].tolist())
+        row = int((~is_good).nonzero()[0])
+        shown = ", ".join(f"{number:g}" for number in found[row].tolist())
         raise invalid(
-            f"{pairs[row][0]} has a pose (x, y, z; w, x, y, z) of {shown}: expected metres within "
+            f"{named[row][0]} has a pose (x, y, z; w, x, y, z) of {shown}: expected metres within "
             f"{FARTHEST_M:g} and a unit quaternion"
         )
-    return rigid_from_rotation(rotation_from_quaternion(found[..., 3:]), found[..., :3])
+    return rigid_from_rotation(rotation_from_quaternion(found[:, 3:]), found[:, :3])
 
 
-def _numbers(pose: Any) -> list[float]:  # noqa: ANN401  a Pose
+def _numbers(pose: Message) -> list[float]:
     vec, quat = pose.vec, pose.quat
     return [vec.x, vec.y, vec.z, quat.w, quat.x, quat.y, quat.z]
 
 
-def matrix_of(pose: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  a Pose
+def matrix_of(pose: Message) -> Float[Tensor, "4 4"]:
     """The transform (float64) that a pose's message says; `pose_message` the other way round."""
     numbers = torch.tensor(_numbers(pose), dtype=torch.float64)
     return rigid_from_rotation(rotation_from_quaternion(numbers[3:]), numbers[:3])
 
 
-def pose_message(world_from_body: Float[Tensor, "4 4"]) -> Any:  # noqa: ANN401  a Pose
+def pose_message(world_from_body: Float[Tensor, "4 4"]) -> Message:
     """A pose as a message; float32 there."""
     x, y, z = world_from_body[:3, 3].tolist()
     w, i, j, k = quaternion_from_rotation(world_from_body[:3, :3]).tolist()
@@ -226,7 +247,7 @@ def pose_message(world_from_body: Float[Tensor, "4 4"]) -> Any:  # noqa: ANN401 
 
 def trajectory_message(
     timestamps_ns: Sequence[int], world_from_body: Float[Tensor, "times 4 4"]
-) -> Any:  # noqa: ANN401  a Trajectory
+) -> Message:
     """Poses at times as a message."""
     return common_pb2.Trajectory(
         poses=[
@@ -236,7 +257,7 @@ def trajectory_message(
     )
 
 
-def camera_message(name: str, camera: Camera) -> Any:  # noqa: ANN401  a CameraSpec
+def camera_message(name: str, camera: Camera) -> Message:
     """The lens of a camera as a message."""
     across_s = (0.0, 0.0) if camera.shutter is None else camera.shutter.across_s
     across = tuple(math.copysign(1.0, each) if each else 0.0 for each in across_s)

@@ -15,7 +15,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation, rigid_from_tangent
 from lidarpainter_models.scenes.tracks import ActorTrack
-from lidarpainter_models.serving.messages import TimedRequest, middle_of
+from lidarpainter_models.serving.messages import SensorRequest, TimedRequest, middle_of
 from lidarpainter_models.serving.refusals import invalid
 
 PARKED_M = 1.0
@@ -62,6 +62,28 @@ class Moment:
 def same_pose(first: Tensor, second: Tensor) -> Tensor:
     """Whether poses are equal as far as messages tell."""
     return torch.isclose(first, second, rtol=ROUNDING, atol=ROUNDING).all(-1).all(-1)
+
+
+def same_lens(first: Camera, second: Camera) -> bool:
+    """Whether two pinholes are the same but for rounding."""
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    return all(abs(getattr(first, n) - getattr(second, n)) < 1e-6 * first.width_px for n in names)
+
+
+def reads_alike(request: SensorRequest, camera: Camera) -> bool:
+    """Whether a request has the shutter of a recorded camera."""
+    shutter = camera.shutter
+    if shutter is None or not shutter.is_rolling:
+        return not request.readout_s
+    readout_s = sum(map(abs, shutter.across_s))
+    if any(
+        abs(asked - own) > 2e-6
+        for asked, own in zip(request.across_s, shutter.across_s, strict=True)
+    ):
+        return False
+    half = torch.stack([-shutter.twist_per_s, shutter.twist_per_s]) * (readout_s / 2)
+    ends = camera.world_from_camera.double() @ rigid_from_tangent(half)
+    return bool(same_pose(request.world_from_sensor, ends).all())
 
 
 def placed_actors(

@@ -27,12 +27,11 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
 from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from lidarpainter_models.geometry.cameras import Camera, Shutter
-from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.records import RecordedView, ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
 from lidarpainter_models.serving.messages import SensorRequest, TimedRequest
@@ -40,6 +39,8 @@ from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.placed_actors import (
     Moment,
     placed_actors,
+    reads_alike,
+    same_lens,
     same_pose,
     twists_of,
 )
@@ -86,6 +87,7 @@ class ServedScene:
     _views: dict[str, tuple[tuple[RecordedView, ...], Tensor]] = field(
         default_factory=dict, init=False
     )
+    _found: dict[ViewKey, Camera] = field(default_factory=dict, init=False)
     _distances: dict[str, EnvelopeDistance] = field(default_factory=dict, init=False)
     _lock: Lock = field(default_factory=Lock, init=False)
 
@@ -116,6 +118,15 @@ class ServedScene:
             return None
         builder = self.builder
         return EvidenceGatherer(self.scene, builder.lidar_map, builder.training_views)
+
+    def showing(self, scene: GaussianScene) -> "ServedScene":
+        """The same scene changed: what is known of its log, and what was found out, is kept."""
+        other = replace(self, builder=self.builder.showing(scene, self.builder.boxes))
+        kept = ("_lenses", "_views", "_found", "_distances", "_lock")
+        other.__dict__.update({name: getattr(self, name) for name in kept})
+        if self.evidence is not None:
+            other.__dict__["evidence"] = self.evidence.showing(scene)
+        return other
 
     def frame(self, request: SensorRequest, client: str = "") -> Frame:
         """The image that a request asks for.
@@ -212,11 +223,18 @@ class ServedScene:
         view = views[int((times_ns - request.middle_ns).abs().argmin())]
         if abs(view.timestamp_ns - request.middle_ns) > SAME_TIME_NS:
             return None
-        size = {"width_px": request.camera.width_px, "height_px": request.camera.height_px}
-        camera = self.found(view, view.camera.resized(**size))
+        camera = self._found_view(view).resized(
+            width_px=request.camera.width_px, height_px=request.camera.height_px
+        )
         if not bool(same_pose(middle, camera.world_from_camera.double())):
             return None
-        return (view, camera) if _reads_alike(request, camera) else None
+        return (view, camera) if reads_alike(request, camera) else None
+
+    def _found_view(self, view: RecordedView) -> Camera:
+        """As `found`, kept: every client asks for recorded moments again and again."""
+        if view.key not in self._found:
+            self._found[view.key] = self.found(view)
+        return self._found[view.key]
 
     def _views_of(self, name: str) -> tuple[tuple[RecordedView, ...], Int[Tensor, " views"]]:
         """The recorded views of a camera, and when they were taken."""
@@ -234,7 +252,7 @@ class ServedScene:
         pinhole = request.camera.pinhole_at(moment.world_from_camera)
         if pinhole is not None:
             camera = replace(pinhole, shutter=moment.shutter)
-            if moment.recorded is not None and _same_lens(camera, moment.recorded):
+            if moment.recorded is not None and same_lens(camera, moment.recorded):
                 camera = moment.recorded
             if painter is not None:
                 return painter("", camera)
@@ -314,25 +332,3 @@ class ServedScene:
         camera = fit_camera(self.recorded.views_of(name)[0], self.observation)
         camera = camera.resized(width_px=seen.shape[1], height_px=seen.shape[0])
         return lens.meeting(seen, camera)
-
-
-def _same_lens(first: Camera, second: Camera) -> bool:
-    """Whether two pinholes are the same but for rounding."""
-    names = ("fx_px", "fy_px", "cx_px", "cy_px")
-    return all(abs(getattr(first, n) - getattr(second, n)) < 1e-6 * first.width_px for n in names)
-
-
-def _reads_alike(request: SensorRequest, camera: Camera) -> bool:
-    """Whether a request has the shutter of a recorded camera."""
-    shutter = camera.shutter
-    if shutter is None or not shutter.is_rolling:
-        return not request.readout_s
-    readout_s = sum(map(abs, shutter.across_s))
-    if any(
-        abs(asked - own) > 2e-6
-        for asked, own in zip(request.across_s, shutter.across_s, strict=True)
-    ):
-        return False
-    half = torch.stack([-shutter.twist_per_s, shutter.twist_per_s]) * (readout_s / 2)
-    ends = camera.world_from_camera.double() @ rigid_from_tangent(half)
-    return bool(same_pose(request.world_from_sensor, ends).all())

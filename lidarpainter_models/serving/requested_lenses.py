@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
-from lidarpainter_models.serving.protos import sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, sensorsim_pb2
 from lidarpainter_models.serving.refusals import invalid
 from lidarpainter_models.serving.sensor_cameras import (
     PinholeLens,
@@ -24,7 +23,7 @@ MOST_OF_TWO = 36
 IDENTITY = (1.0, 0.0, 0.0, 1.0)
 
 
-def checked_size(message: Any, spec: Any) -> tuple[int, int]:  # noqa: ANN401  messages
+def checked_size(message: Message, spec: Message) -> tuple[int, int]:
     """Width and height of a requested image: those of the lens, or the lens scaled.
 
     Raises:
@@ -56,7 +55,7 @@ def _check_pixels(what: str, size: tuple[int, int]) -> None:
         )
 
 
-def sensor_camera(spec: Any) -> SensorCamera:  # noqa: ANN401  a CameraSpec
+def sensor_camera(spec: Message) -> SensorCamera:
     """The lens of a `CameraSpec` at its own size.
 
     Raises:
@@ -89,7 +88,7 @@ def sensor_camera(spec: Any) -> SensorCamera:  # noqa: ANN401  a CameraSpec
 Lens = tuple[PinholeLens | RadialLens, tuple[float, float, float, float]]
 
 
-def _pinhole(param: Any, _spec: Any) -> Lens:  # noqa: ANN401
+def _pinhole(param: Message, _spec: Message) -> Lens:
     return PinholeLens(
         radial=_terms("radial_coeffs", param.radial_coeffs, 6),
         tangential=_terms("tangential_coeffs", param.tangential_coeffs, 2),
@@ -97,14 +96,14 @@ def _pinhole(param: Any, _spec: Any) -> Lens:  # noqa: ANN401
     ), _focal(param)
 
 
-def _fisheye(param: Any, _spec: Any) -> Lens:  # noqa: ANN401
+def _fisheye(param: Message, _spec: Message) -> Lens:
     k1, k2, k3, k4 = (*_terms("radial_coeffs", param.radial_coeffs, 4), 0.0, 0.0, 0.0, 0.0)[:4]
     angle_rad = _max_angle(param)
     curve = RisingCurve((0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4), angle_rad)
     return RadialLens(curve, is_of_angle=True, max_angle_rad=angle_rad), _focal(param)
 
 
-def _ftheta(param: Any, spec: Any) -> Lens:  # noqa: ANN401
+def _ftheta(param: Message, spec: Message) -> Lens:
     of_angle = _terms("angle_to_pixeldist_poly", param.angle_to_pixeldist_poly, MOST_TERMS)
     of_distance = _terms("pixeldist_to_angle_poly", param.pixeldist_to_angle_poly, MOST_TERMS)
     kinds = sensorsim_pb2.FthetaCameraParam
@@ -124,7 +123,7 @@ def _ftheta(param: Any, spec: Any) -> Lens:  # noqa: ANN401
     return RadialLens(curve, is_of_angle=is_of_angle, max_angle_rad=angle_rad), matrix
 
 
-def _windshield(spec: Any) -> Windshield | None:  # noqa: ANN401
+def _windshield(spec: Message) -> Windshield | None:
     if spec.WhichOneof("external_distortion") is None:
         return None
     param = spec.bivariate_windshield_model_param
@@ -146,14 +145,14 @@ def _is_triangular(count: int) -> bool:
     return count in {n * (n + 1) // 2 for n in range(2, 9)}
 
 
-def _focal(param: Any) -> tuple[float, float, float, float]:  # noqa: ANN401
+def _focal(param: Message) -> tuple[float, float, float, float]:
     focal = (param.focal_length_x, param.focal_length_y)
     if not all(0.01 <= each <= 1e6 for each in focal):
         raise invalid(f"focal_length {focal[0]:g}, {focal[1]:g} px: expected 0.01 to 1000000")
     return focal[0], 0.0, 0.0, focal[1]
 
 
-def _max_angle(param: Any) -> float:  # noqa: ANN401
+def _max_angle(param: Message) -> float:
     """From the axis; half a turn where none is said."""
     angle_rad = float(param.max_angle)
     if not 0 <= angle_rad < math.inf:

@@ -5,8 +5,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import Lock
 
+from lidarpainter_models.serving.messages import TimedRequest
 from lidarpainter_models.serving.refusals import RequestError
 from lidarpainter_models.serving.renderer import ServedScene
+from lidarpainter_models.serving.scene_edits import SceneEdits
 
 MOST_TOLD = 20
 """Names in a line about a scene that is not there."""
@@ -16,7 +18,7 @@ MOST_TOLD = 20
 class LoadedScene:
     """A scene in memory."""
 
-    scene: ServedScene
+    edits: SceneEdits
     num_bytes: int
     """About what it takes."""
 
@@ -35,8 +37,18 @@ class ScenePool:
     _loaded: OrderedDict[str, LoadedScene] = field(default_factory=OrderedDict, init=False)
     _lock: Lock = field(default_factory=Lock, init=False)
 
-    def get(self, name: str) -> ServedScene:
-        """The scene of a name; the others make room where memory is short.
+    def get(self, name: str, request: TimedRequest | None = None) -> ServedScene:
+        """The scene of a name as its clients have it, with who else is in a request.
+
+        Raises:
+            RequestError: NOT_FOUND; what `SceneEdits.shown` refuses.
+        """
+        return self.edits_of(name).shown(request)
+
+    def edits_of(self, name: str) -> SceneEdits:
+        """What is changed in the scene of a name; others make room where memory is short.
+
+        One that was changed stays until it is restored.
 
         Raises:
             RequestError: NOT_FOUND.
@@ -50,14 +62,18 @@ class ScenePool:
             if run not in self._loaded:
                 self._loaded[run] = self.load(run)
             self._loaded.move_to_end(run)
-            while len(self._loaded) > 1 and self._num_bytes() > self.most_bytes:
-                self._loaded.popitem(last=False)
-            return self._loaded[run].scene
+            for other in [*self._loaded][:-1]:
+                num_bytes = sum(each.num_bytes for each in self._loaded.values())
+                if num_bytes > self.most_bytes and not self._loaded[other].edits.is_edited:
+                    del self._loaded[other]
+            return self._loaded[run].edits
 
     def loaded(self) -> tuple[str, ...]:
         """Names of the scenes in memory, as clients are told them."""
         runs = tuple(self._loaded)
         return tuple(name for name in self.announced if self.runs[name] in runs)
 
-    def _num_bytes(self) -> int:
-        return sum(each.num_bytes for each in self._loaded.values())
+    def num_changes(self) -> int:
+        """How often a scene in memory was changed: what was asked before is another question."""
+        with self._lock:
+            return sum(each.edits.num_changes for each in self._loaded.values())

@@ -159,19 +159,10 @@ class PinholeLens:
         x, y = plane.unbind(-1)
         square = x * x + y * y
         factor = self._factor(square)
-        return torch.stack(
-            [
-                x * factor
-                + 2 * p1 * x * y
-                + p2 * (square + 2 * x * x)
-                + square * (s1 + s2 * square),
-                y * factor
-                + p1 * (square + 2 * y * y)
-                + 2 * p2 * x * y
-                + square * (s3 + s4 * square),
-            ],
-            dim=-1,
-        )
+        across = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        down = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+        prism = square * (s1 + s2 * square), square * (s3 + s4 * square)
+        return torch.stack([across + prism[0], down + prism[1]], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -276,6 +267,17 @@ class SensorCamera:
     width_px: int
     height_px: int
     windshield: Windshield | None = None
+
+    @classmethod
+    def of_pinhole(cls, camera: Camera) -> "SensorCamera":
+        """A pinhole that distorts nothing."""
+        return cls(
+            lens=PinholeLens(),
+            pixels_per_unit=(camera.fx_px, 0.0, 0.0, camera.fy_px),
+            middle_px=(camera.cx_px, camera.cy_px),
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+        )
 
     def resized(self, width_px: int, height_px: int) -> "SensorCamera":
         """The same view on another grid (edges of the image stay aligned)."""

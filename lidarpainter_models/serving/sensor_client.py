@@ -19,7 +19,7 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.serving.messages import LENGTH_TOLERANCE, matrix_of, pose_message
-from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.trust import KEYS
 from lidarpainter_models.serving.wire import MOST_BYTES, client, grpc_package
 
@@ -151,7 +151,7 @@ def _one_line(place: str) -> Iterator[None]:
         raise DataError(f"{place}: {code}: {said[:300]}") from None
 
 
-def _seat(camera: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  an AvailableCamera
+def _seat(camera: Message) -> Float[Tensor, "4 4"]:
     """Where a camera sits in the car; the renderer may be anybody's."""
     quat, spec = camera.rig_to_camera.quat, camera.intrinsics
     length = math.hypot(quat.w, quat.x, quat.y, quat.z)
@@ -162,7 +162,7 @@ def _seat(camera: Any) -> Float[Tensor, "4 4"]:  # noqa: ANN401  an AvailableCam
     return seat
 
 
-def _decoded(item: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401  an item of a reply
+def _decoded(item: Message) -> UInt8[np.ndarray, "height width 3"]:
     if not item.success:
         raise DataError(f"camera {item.camera_name}: {item.error_message[:300]}")
     image = decode_image(item.result.image_bytes)

@@ -20,7 +20,7 @@ from lidarpainter_models.lidar.firings import SweepRays, unanswered_rays
 from lidarpainter_models.lidar.sensors import PRESETS, LidarSensor
 from lidarpainter_models.serving.messages import TimedRequest, read_timed
 from lidarpainter_models.serving.placed_actors import placed_actors
-from lidarpainter_models.serving.protos import sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, sensorsim_pb2
 from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.renderer import ServedScene
 
@@ -67,7 +67,7 @@ class MeasuredPoints:
     """0 to 1, of what the log's own LiDAR reports of its brightest surface."""
 
 
-def read_sweep(message: Any) -> SweepRequest:  # noqa: ANN401  a LidarRenderRequest
+def read_sweep(message: Message) -> SweepRequest:
     """What a `LidarRenderRequest` asks for.
 
     Raises:
@@ -126,7 +126,7 @@ def measured_points(served: ServedScene, request: SweepRequest) -> MeasuredPoint
     )
 
 
-def points_message(points: MeasuredPoints) -> Any:  # noqa: ANN401  a LidarRenderReturn
+def points_message(points: MeasuredPoints) -> Message:
     """Points as a message: as numbers, and as bytes (float32, lowest byte first) alike."""
     xyz_m, intensity = points.xyz_m.contiguous().numpy(), points.intensity.numpy()
     return sensorsim_pb2.LidarRenderReturn(

@@ -9,14 +9,14 @@ import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from google.protobuf import descriptor_pb2
+from google.protobuf import descriptor_pb2, text_format
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
-from lidarpainter_models.serving.servicer import SensorsimServicer
+from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.servicer import SensorsimServicer, answering
 from lidarpainter_models.serving.wire import (
     MOST_BYTES,
     PACKAGES,
@@ -48,7 +48,7 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
     size = [(f"grpc.max_{way}_message_length", MOST_BYTES) for way in ("send", "receive")]
     pool = ThreadPoolExecutor(servicer.queue.most_waiting + SPARE_THREADS, "call")
     server = grpc.server(pool, options=[*size, ("grpc.so_reuseport", 0)])
-    server.add_generic_rpc_handlers(handlers(servicer))
+    server.add_generic_rpc_handlers(handlers(servicer, answering))
     state = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(state, server)
     _add_reflection(server)
@@ -76,41 +76,20 @@ def _check_port(host: str, port: int) -> None:
         ) from None
 
 
-def described_services() -> Any:  # noqa: ANN401  upb has a pool of its own
+def described_services() -> Message:
     """Descriptors of the service under each of its names."""
     from grpc_health.v1 import health_pb2
 
     pool = DescriptorPool()
-    for known in (common_pb2.DESCRIPTOR, health_pb2.DESCRIPTOR):
-        pool.Add(_proto_of(known))
+    for known in (common_pb2, health_pb2):
+        pool.AddSerializedFile(known.DESCRIPTOR.serialized_pb)
+    own = descriptor_pb2.FileDescriptorProto.FromString(sensorsim_pb2.DESCRIPTOR.serialized_pb)
     for package in PACKAGES:
-        proto = _proto_of(sensorsim_pb2.DESCRIPTOR)
-        if package != PACKAGES[0]:
-            proto.name, proto.package = f"{package}/{proto.name}", package
-            for named in _type_names(proto):
-                if named.type_name.startswith(f".{PACKAGES[0]}."):
-                    named.type_name = named.type_name.replace(PACKAGES[0], package, 1)
-            for method in proto.service[0].method:
-                method.input_type = method.input_type.replace(PACKAGES[0], package, 1)
-                method.output_type = method.output_type.replace(PACKAGES[0], package, 1)
-        pool.Add(proto)
+        text = text_format.MessageToString(own).replace(PACKAGES[0], package)
+        file = text_format.Parse(text, descriptor_pb2.FileDescriptorProto())
+        file.name = f"{package}/{own.name}"
+        pool.Add(file)
     return pool
-
-
-def _proto_of(file: Any) -> descriptor_pb2.FileDescriptorProto:  # noqa: ANN401
-    proto = descriptor_pb2.FileDescriptorProto()
-    file.CopyToProto(proto)
-    return proto
-
-
-def _type_names(
-    holder: descriptor_pb2.FileDescriptorProto | descriptor_pb2.DescriptorProto,
-) -> Iterator[descriptor_pb2.FieldDescriptorProto]:
-    """All fields of the messages of a file, or of the messages inside of one."""
-    is_file = isinstance(holder, descriptor_pb2.FileDescriptorProto)
-    for message in holder.message_type if is_file else holder.nested_type:
-        yield from message.field
-        yield from _type_names(message)
 
 
 def _add_reflection(server: "grpc.Server") -> None:

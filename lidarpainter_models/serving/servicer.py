@@ -4,8 +4,7 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
-from functools import wraps
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -15,9 +14,10 @@ from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.serving import scene_messages
 from lidarpainter_models.serving.image_formats import encoded_within
 from lidarpainter_models.serving.messages import SensorRequest, read_request
-from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.refusals import Code, RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
+from lidarpainter_models.serving.renderer import ServedScene
 from lidarpainter_models.serving.scene_pool import ScenePool
 from lidarpainter_models.serving.served_sweeps import (
     measured_points,
@@ -34,8 +34,7 @@ MOST_BYTES_KEY = "lidarpainter-max-reply-bytes"
 """Metadata of a request whose reply must not be larger: images become JPEGs as good as allowed."""
 MOST_ITEMS, MOST_SWEEPS = 64, 8
 """Of a batch."""
-API_VERSION = (0, 0, 5)
-Answer = TypeVar("Answer", bound=Callable[..., Any])
+API_VERSION = {"major": 0, "minor": 0, "patch": 5}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +57,12 @@ class _Made:
     refusal: RequestError | None = None
 
 
-def answered(answer: Answer) -> Answer:
-    """Turn refusals into gRPC's status codes; whatever else fails is one line too."""
+def answering(answer: Callable[..., Message]) -> Callable[..., Message]:
+    """A call whose refusals are gRPC's status codes; whatever else fails is one line too."""
 
-    @wraps(answer)
-    def call(self: Any, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401
+    def call(message: Message, context: "ServicerContext") -> Message:
         try:
-            return answer(self, message, context)
+            return answer(message, context)
         except RequestError as error:
             code: Code | str = error.code
             why = str(error)
@@ -76,7 +74,16 @@ def answered(answer: Answer) -> Answer:
             code, why = "INTERNAL", f"unexpected {type(error).__name__}: {error}".splitlines()[0]
         return context.abort(getattr(grpc_package().StatusCode, code), why)
 
-    return call  # type: ignore[return-value]
+    return call
+
+
+def _told_of(tell: Callable[[ServedScene], Message]) -> Callable[..., Message]:
+    """A call that asks what is known of a scene."""
+
+    def call(self: "SensorsimServicer", message: Message, _context: "ServicerContext") -> Message:
+        return tell(self.scenes.get(message.scene_id))
+
+    return call
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,92 +105,73 @@ class SensorsimServicer:
     is_painted: bool = False
     """Whether images lean on those that the same client asked for before."""
 
-    @answered
-    def render_rgb(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def render_rgb(self, message: Message, context: "ServicerContext") -> Message:
         (made,) = self._made([message], context)
         if made.refusal is not None:
             raise made.refusal
         return sensorsim_pb2.RGBRenderReturn(image_bytes=made.data)
 
-    @answered
-    def batch_render_rgb(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def batch_render_rgb(self, message: Message, context: "ServicerContext") -> Message:
         found = self._made([item.request for item in message.items], context)
-        return sensorsim_pb2.BatchRGBRenderReturn(
-            items=[
-                sensorsim_pb2.BatchRGBRenderReturnItem(
-                    camera_name=item.camera_name,
-                    result=sensorsim_pb2.RGBRenderReturn(image_bytes=made.data),
-                    success=made.refusal is None,
-                    error_message="" if made.refusal is None else str(made.refusal),
-                )
-                for item, made in zip(message.items, found, strict=True)
-            ]
-        )
+        reply = sensorsim_pb2.BatchRGBRenderReturn()
+        for item, made in zip(message.items, found, strict=True):
+            reply.items.add(
+                camera_name=item.camera_name,
+                result=sensorsim_pb2.RGBRenderReturn(image_bytes=made.data),
+                success=made.refusal is None,
+                error_message="" if made.refusal is None else str(made.refusal),
+            )
+        return reply
 
     batch_render_camera = batch_render_rgb
 
-    @answered
-    def render_aggregated(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def render_aggregated(self, message: Message, context: "ServicerContext") -> Message:
         if len(message.lidar_requests) > MOST_SWEEPS:
             raise invalid(f"{len(message.lidar_requests)} sweeps: expected at most {MOST_SWEEPS}")
         asks_for_sweeps_alone = message.lidar_requests and not message.rgb_requests
         found = [] if asks_for_sweeps_alone else self._made(message.rgb_requests, context)
-        refusals = [made.refusal for made in found if made.refusal is not None]
-        if refusals:
-            raise refusals[0]
+        for made in found:
+            if made.refusal is not None:
+                raise made.refusal
         return sensorsim_pb2.AggregatedRenderReturn(
             rgb_returns=[sensorsim_pb2.RGBRenderReturn(image_bytes=one.data) for one in found],
             lidar_returns=[self._sweep(one, context) for one in message.lidar_requests],
         )
 
-    @answered
-    def get_version(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        major, minor, patch = API_VERSION
+    def render_lidar(self, message: Message, context: "ServicerContext") -> Message:
+        return self._sweep(message, context)
+
+    def get_version(self, _message: Message, _context: "ServicerContext") -> Message:
         return common_pb2.VersionId(
             version_id=f"lidarpainter {lidarpainter_models.__version__}",
-            grpc_api_version=common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch),
+            grpc_api_version=common_pb2.VersionId.APIVersion(**API_VERSION),
         )
 
-    @answered
-    def get_available_scenes(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def get_available_scenes(self, _message: Message, _context: "ServicerContext") -> Message:
         return common_pb2.AvailableScenesReturn(scene_ids=self.scenes.announced)
 
-    @answered
-    def get_loaded_scenes(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        entry = sensorsim_pb2.LoadedScenesReturn.LoadedSceneEntry
-        return sensorsim_pb2.LoadedScenesReturn(
-            scenes=[
-                entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
-                for name in self.scenes.loaded()
-            ],
-            loaded_instance_capacity=len(self.scenes.announced),
+    def get_loaded_scenes(self, _message: Message, _context: "ServicerContext") -> Message:
+        reply = sensorsim_pb2.LoadedScenesReturn(
+            loaded_instance_capacity=len(self.scenes.announced)
         )
+        for name in self.scenes.loaded():
+            reply.scenes.add(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
+        return reply
 
-    @answered
-    def get_available_cameras(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        return scene_messages.cameras(self.scenes.get(message.scene_id))
+    get_available_cameras = _told_of(scene_messages.cameras)
+    get_available_trajectories = _told_of(scene_messages.trajectories)
+    get_dynamic_objects = _told_of(scene_messages.dynamic_objects)
 
-    @answered
-    def get_available_trajectories(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        return scene_messages.trajectories(self.scenes.get(message.scene_id))
-
-    @answered
-    def get_available_ego_masks(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        masks = []
+    def get_available_ego_masks(self, _message: Message, _context: "ServicerContext") -> Message:
+        reply = sensorsim_pb2.AvailableEgoMasksReturn()
         for name in self.scenes.announced:
-            masks += scene_messages.ego_masks(name, self.scenes.get(name))
-        return sensorsim_pb2.AvailableEgoMasksReturn(ego_mask_metadata=masks)
+            scene_messages.add_ego_masks(reply, name, self.scenes.get(name))
+        return reply
 
-    @answered
-    def get_dynamic_objects(self, message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        return scene_messages.dynamic_objects(self.scenes.get(message.scene_id))
-
-    @answered
-    def get_server_config(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def get_server_config(self, _message: Message, _context: "ServicerContext") -> Message:
         return sensorsim_pb2.ServerConfigReturn(server_config=self.config)
 
-    @answered
-    def shut_down(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
+    def shut_down(self, _message: Message, _context: "ServicerContext") -> Message:
         if self.shut_down_asked is None:
             raise RequestError(
                 "FAILED_PRECONDITION", "the server was started without --allow-shut-down"
@@ -191,35 +179,39 @@ class SensorsimServicer:
         self.shut_down_asked()
         return common_pb2.Empty()
 
-    @answered
-    def render_lidar(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        return self._sweep(message, context)
+    def get_external_asset_objects(self, message: Message, _context: "ServicerContext") -> Message:
+        names = self.scenes.edits_of(message.scene_id).library.names
+        return sensorsim_pb2.ExternalAssetObjectsReturn(track_ids=names)
 
-    @answered
-    def get_external_asset_objects(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        raise RequestError("UNIMPLEMENTED", "this server has no assets from outside of its scenes")
+    def edit_assets(self, message: Message, context: "ServicerContext") -> Message:
+        edits = self.scenes.edits_of(message.scene_id)
 
-    @answered
-    def edit_assets(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        raise RequestError(
-            "UNIMPLEMENTED", "scenes are edited by `lidarpainter edit`, whose runs are served too"
-        )
+        def edited() -> Message:
+            try:
+                edits.edit(message)
+            except LidarPainterError as error:
+                return sensorsim_pb2.EditAssetsReturn(success=False, message=str(error))
+            return sensorsim_pb2.EditAssetsReturn(success=True)
 
-    @answered
-    def restore_model_parameters(self, _message: Any, _context: "ServicerContext") -> Any:  # noqa: ANN401, D102
-        raise RequestError("UNIMPLEMENTED", "this server changes no scene")
+        return self.queue.answer(object(), edited, context.time_remaining())
 
-    def _sweep(self, message: Any, context: "ServicerContext") -> Any:  # noqa: ANN401
+    def restore_model_parameters(self, message: Message, context: "ServicerContext") -> Message:
+        edits = self.scenes.edits_of(message.scene_id)
+        self.queue.answer(object(), edits.restore, context.time_remaining())
+        return common_pb2.Empty()
+
+    def _sweep(self, message: Message, context: "ServicerContext") -> Message:
         """The points of one LiDAR, as a message."""
 
-        def measured() -> Any:  # noqa: ANN401
+        def measured() -> Message:
             request = read_sweep(message)
-            return points_message(measured_points(self.scenes.get(request.scene_id), request))
+            served = self.scenes.get(request.scene_id, request)
+            return points_message(measured_points(served, request))
 
-        key = message.SerializeToString(deterministic=True)
+        key = (message.SerializeToString(deterministic=True), self.scenes.num_changes())
         return self.queue.answer(key, measured, context.time_remaining())
 
-    def _made(self, messages: Sequence[Any], context: "ServicerContext") -> list[_Made]:
+    def _made(self, messages: Sequence[Message], context: "ServicerContext") -> list[_Made]:
         """The images of a message, drawn together; each is there or says why it is not."""
         if not 0 < len(messages) <= MOST_ITEMS:
             raise invalid(f"a batch of {len(messages)} images: expected 1 to {MOST_ITEMS}")
@@ -229,6 +221,7 @@ class SensorsimServicer:
             tuple(each.SerializeToString(deterministic=True) for each in messages),
             most_bytes,
             client,
+            self.scenes.num_changes(),
         )
         found = self.queue.answer(
             key, lambda: self._draw(messages, share, client), context.time_remaining()
@@ -242,17 +235,18 @@ class SensorsimServicer:
             )
         return found
 
-    def _draw(self, messages: Sequence[Any], share: int, client: str) -> list[_Made]:
-        def draw(message: Any) -> _Made:  # noqa: ANN401
+    def _draw(self, messages: Sequence[Message], share: int, client: str) -> list[_Made]:
+        def draw(message: Message) -> _Made:
             return self._drawn(message, share, client)
 
         return list(side_by_side(draw, messages, self.device))
 
-    def _drawn(self, message: Any, share: int, client: str) -> _Made:  # noqa: ANN401
+    def _drawn(self, message: Message, share: int, client: str) -> _Made:
         begun, request, made = time.perf_counter(), None, _Made()
         try:
             request = read_request(message)
-            frame = self.scenes.get(request.scene_id).frame(request, client)
+            served = self.scenes.get(request.scene_id, request)
+            frame = served.frame(request, client)
             made = _Made(trust=frame.trust)
             self._refuse_untrusted(frame.trust)
             data = encoded_within(frame.rgb_u8, request.encoding, share)

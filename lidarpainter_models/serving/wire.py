@@ -4,15 +4,17 @@ Clients of different age know the service by different package names; messages a
 same, so one servicer answers under all of them.
 """
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from lidarpainter_models.errors import MissingPackageError
-from lidarpainter_models.serving.protos import common_pb2, sensorsim_pb2
+from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 
 if TYPE_CHECKING:
     import grpc
 
+Call = Callable[..., Message]
 SERVICE = "SensorsimService"
 PACKAGES = ("nre.grpc.protos.sensorsim", "sensorsim", "nurec.grpc.protos.sensorsim")
 """Packages that clients look for the service in; the first one is that of our descriptors."""
@@ -50,12 +52,14 @@ def calls() -> dict[str, tuple[Any, Any]]:
     }
 
 
-def _class_of(descriptor: Any) -> Any:  # noqa: ANN401  protobuf has no type for it
+def _class_of(descriptor: Message) -> Message:
     module = common_pb2 if descriptor.file is common_pb2.DESCRIPTOR else sensorsim_pb2
     return getattr(module, descriptor.name)
 
 
-def handlers(servicer: object) -> list["grpc.GenericRpcHandler"]:
+def handlers(
+    servicer: object, wrapped: Callable[[Call], Call] = lambda call: call
+) -> list["grpc.GenericRpcHandler"]:
     """What a server registers so that `servicer` answers every call under every name.
 
     Each call is a method of its own name, which takes the message and gRPC's context.
@@ -63,7 +67,7 @@ def handlers(servicer: object) -> list["grpc.GenericRpcHandler"]:
     grpc = grpc_package()
     methods = {
         name: grpc.unary_unary_rpc_method_handler(
-            getattr(servicer, name),
+            wrapped(getattr(servicer, name)),
             request_deserializer=request.FromString,
             response_serializer=reply.SerializeToString,
         )

@@ -1,10 +1,8 @@
 """`lidarpainter serve`: a run that simulators can call, until a signal ends it."""
 
 import json
-import os
 import re
 import signal
-import subprocess
 import sys
 import time
 
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refuse, succeed
+from served_process import serving
 from tiny_street import FRONT, SCENE
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -30,18 +29,8 @@ LONGEST_S = 2.0
 def server(tiny_run, tmp_path_factory):
     """The process of a server, where it listens, and its log."""
     log = tmp_path_factory.mktemp("serve") / "trust.csv"
-    words = ["--store", str(tiny_run.store.root), "serve", tiny_run.run_id, "--port", "0"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", *words, "--http-port", "0", "--log", str(log)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    addresses = [process.stdout.readline().strip() for _ in range(2)]
-    with process:
+    with serving(tiny_run, "--http-port", "0", "--log", log) as (process, addresses):
         yield process, addresses, log
-        process.kill()
 
 
 def test_a_served_run_answers_as_render_and_ends_soon(tiny_run, server, tmp_path):

@@ -8,8 +8,6 @@ from commands import refuse, succeed
 from tiny_street import FRONT, NUM_FRAMES, SCENE, SIDE
 
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track
-from lidarpainter_models.serving.protos import sensorsim_pb2
-from lidarpainter_models.serving.scene_messages import cameras
 from tasks.opened import open_scene
 
 
@@ -142,21 +140,3 @@ def test_wrong_words_of_a_drive_are_refused(tiny_run, tmp_path, monkeypatch):
     ):
         assert complaint in refuse(*drive, *words, store=tiny_run.store)
     assert not (tmp_path / "d" / "drive.mp4").exists()
-
-
-def test_the_seat_of_a_camera_is_the_same_in_the_bundle_and_on_the_wire(tiny_run, bundle):
-    from flows.serve import ServeRequest, _load
-    from tasks.runs import open_run
-
-    served = _load(
-        tiny_run.store,
-        open_run(tiny_run.store, tiny_run.run_id),
-        ServeRequest(runs=(tiny_run.run_id,)),
-    ).scene
-    told = cameras(served)
-    assert isinstance(told, sensorsim_pb2.AvailableCamerasReturn)
-    by_name = {one.logical_id: one.rig_to_camera.vec for one in told.available_cameras}
-    for one in read_bundle(bundle[0]).rig["camera_calibrations"].values():
-        vec = by_name[one["logical_sensor_name"]]
-        there = np.array(one["T_sensor_rig"])[:3, 3]
-        np.testing.assert_allclose([vec.x, vec.y, vec.z], there, atol=1e-5)

@@ -116,3 +116,15 @@ def test_points_that_do_not_fit_together_are_refused():
             width_px=2,
             radius_px=-1,
         )
+
+
+@pytest.mark.parametrize("most_px", [0, 1, 3])
+def test_points_many_times_as_many_as_pixels_keep_the_same_ones(most_px):
+    """Where discs are drawn of the nearest points alone; depths are rounded, so that many tie."""
+    random = torch.Generator().manual_seed(most_px)
+    pixels_uv = torch.rand(20_000, 2, generator=random) * torch.tensor([40.0, 30]) - 4
+    depth_m = (torch.rand(20_000, generator=random) * 200).round() / 10 - 1
+    radius_px = torch.randint(0, most_px + 1, (20_000,), generator=random)
+    size = {"height_px": 22, "width_px": 32, "radius_px": radius_px}
+    expected = splat_points(pixels_uv, depth_m, **size, backend="reference")
+    assert torch.equal(splat_points(pixels_uv, depth_m, **size), expected)

@@ -45,7 +45,6 @@ def test_a_dense_wall_fills_the_image(camera_at):
     assert image.hit.all()
     assert torch.allclose(image.rgb, torch.tensor([1.0, 0, 0]).expand_as(image.rgb))
     assert torch.allclose(image.depth_m, torch.tensor(10.0))
-    assert (image.age_s == 0).all()
 
 
 def test_an_empty_map_gives_a_black_image(camera_at):

@@ -16,7 +16,7 @@ from lidarpainter_models.serving.render_queue import RenderQueue
 @pytest.fixture
 def http(street):
     queue = RenderQueue(8, 60.0)
-    with TestClient(http_app(HttpScene(served=street.served, queue=queue))) as client:
+    with TestClient(http_app(HttpScene(scene=lambda: street.served, queue=queue))) as client:
         yield client
     queue.close()
 

@@ -129,7 +129,7 @@ def test_a_filter_that_makes_no_sense_is_refused(street, sweep, changes, expecte
 
 def test_a_sweep_over_the_wire_is_the_same_as_numbers_and_as_bytes(street, swept, sweep):
     class Swept:
-        served = swept
+        served, library = swept, street.library
 
     with served(Swept()) as channel:
         client = wire.client(channel)

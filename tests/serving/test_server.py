@@ -244,17 +244,6 @@ def test_only_a_server_that_may_be_ended_is(street):
     assert stopped.is_set()
 
 
-def test_what_is_not_there_says_so_in_one_line(client):
-    calls = wire.calls()
-    names = [
-        "edit_assets",
-        "restore_model_parameters",
-        "get_external_asset_objects",
-    ]
-    for name in names:
-        assert code_of(getattr(client, name), calls[name][0]())[0] == "UNIMPLEMENTED"
-
-
 def test_eight_clients_get_what_one_gets(street, client):
     views = [street.recording.views_of("front_camera")[number % 5] for number in range(8)]
     messages = [street.request(one) for one in views]

@@ -75,13 +75,16 @@ def reference_line(road, step_m=0.25):
         cosine, sine = np.cos(start["hdg"]), np.sin(start["hdg"])
         x, y = start["x"] + cosine * u - sine * v, start["y"] + sine * u + cosine * v
         s = start["s"] + p * start["length"]
-        found.append(np.stack([s, x, y, profile(road, "elevationProfile/elevation", s)], axis=1))
+        found.append(np.stack([s, x, y, heights_m(road, s)], axis=1))
     return np.concatenate(found)
 
 
-def profile(road, place, s_m):
-    """The value of a profile of cubics along the road."""
-    found = [[float(one.get(key)) for key in "sabcd"] for one in road.findall(f"road/{place}")]
+def heights_m(road, s_m):
+    """The height of the reference line along the road."""
+    found = [
+        [float(one.get(key)) for key in "sabcd"]
+        for one in road.findall("road/elevationProfile/elevation")
+    ]
     rows = np.array(found)
     row = rows[np.clip(np.searchsorted(rows[:, 0], s_m, side="right") - 1, 0, len(rows) - 1)]
     ds = s_m - row[:, 0]

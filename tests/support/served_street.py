@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 from functools import cached_property
 
+import torch
 from tiny_street import tiny_street
 
 import lidarpainter_models as lp
@@ -14,10 +15,12 @@ from lidarpainter_models.gaussians.returns.settings import LidarConfig
 from lidarpainter_models.lidar.firings import mounted_lidar
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.serving import wire
-from lidarpainter_models.serving.messages import camera_message, pose_message
+from lidarpainter_models.serving.messages import camera_message, pose_message, trajectory_message
 from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
+from lidarpainter_models.serving.refusals import invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.renderer import ServedScene
+from lidarpainter_models.serving.scene_edits import SceneEdits, world_of
 from lidarpainter_models.serving.scene_pool import LoadedScene, ScenePool
 from lidarpainter_models.serving.server import grpc_server
 from lidarpainter_models.serving.servicer import SensorsimServicer
@@ -78,6 +81,23 @@ class ServedStreet:
             setattr(message, name, value)
         return message
 
+    @cached_property
+    def library(self):
+        """The actors of the street as assets, larger by a tenth each."""
+        return FakeLibrary(world_of(self.served))
+
+    def insertion(self, view, name, **fields):
+        """An `EditAssetsRequest` by which somebody comes who stands before the camera."""
+        ahead = torch.eye(4, dtype=torch.float64)
+        ahead[:3, 3] = torch.tensor([0.0, 0.5, 6.0])
+        turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
+        ahead[:3, :3] = turn
+        pose = self.served.found(view).world_from_camera @ ahead
+        message = pb.EditAssetsRequest(scene_id="street")
+        way = trajectory_message([view.timestamp_ns], pose[None])
+        message.insert.add(id=name, trajectory=way, **fields)
+        return message
+
     def actors_at(self, timestamp_ns):
         """Everybody who is there then, as messages."""
         poses, present = self.scene.actors.refined_poses(timestamp_ns)
@@ -85,6 +105,29 @@ class ServedStreet:
         return [
             placed_object(track.actor_id, pose) for track, pose, is_there in everybody if is_there
         ]
+
+
+class FakeLibrary:
+    """The first actors of a world, by names that tell their order."""
+
+    def __init__(self, world):
+        models = [world.model_of(track) for track in world.moving[:2]]
+        self.models = {
+            f"asset-{number}": one.scaled(1 + 0.1 * number) for number, one in enumerate(models)
+        }
+        self.names = [*self.models]
+        self.categories = sorted({one.category for one in models})
+
+    def model(self, name):
+        if name not in self.models:
+            raise invalid(f"asset {name[:80]!r}: not here")
+        return self.models[name]
+
+    def nearest(self, _category, size_m):
+        def away(name):
+            return 0.0 if size_m is None else float((self.models[name].size_m - size_m).norm())
+
+        return min(self.names, key=away)
 
 
 def placed_object(actor_id, start, end=None):
@@ -96,14 +139,17 @@ def placed_object(actor_id, start, end=None):
 
 
 @contextmanager
-def served(street, *, most_waiting=16, limit_s=60.0, **settings):
+def served(street, *, most_waiting=16, limit_s=60.0, has_placeholders=False, **settings):
     """A client of a server of the street."""
     import grpc
 
+    edits = SceneEdits(
+        fitted=street.served, library=street.library, has_placeholders=has_placeholders
+    )
     pool = ScenePool(
         runs={"street": "run"},
         announced=("street",),
-        load=lambda _run: LoadedScene(street.served, 1),
+        load=lambda _run: LoadedScene(edits, 1),
         most_bytes=10,
     )
     queue = RenderQueue(most_waiting, limit_s)
