@@ -32,10 +32,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera, Shutter
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.backends import may_run_on_host
-from lidarpainter_models.lidar.points_in_view import READ_MARGIN
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 WARP_WEIGHT = 0.9  # support of a pixel that two recorded images show alike
@@ -50,8 +49,6 @@ ALPHA_RANGE = (0.5, 0.95)  # opacity where a surface starts to count, and where 
 REACHES = 12  # times its reach beyond which LiDAR supports nothing: exp(-12)
 CAMERAS_AT_ONCE = 8
 """Recorded cameras that are asked together, those first that are likeliest to have seen a view."""
-RIM = 1e-3
-"""Of half an image: so near its border rounding decides what is inside."""
 LIKENESS_M = 8.0
 """So much farther a camera may stand that looks in the direction of a view, not across it."""
 NEAREST_M = 0.1  # nearer to a camera than this is nothing seen, as in `Camera.contains`
@@ -86,38 +83,37 @@ def is_seen(
     likely -= (poses[:, :3, 3] - pose[:3, 3]).norm(dim=1)
     ordered = [cameras[row] for row in likely.argsort(descending=True).tolist()]
     is_out = torch.ones(len(points_world), dtype=torch.bool)
-    on_rims: list[tuple[Camera, Tensor]] = []
     for first in range(0, len(ordered), CAMERAS_AT_ONCE):
         out = is_out.nonzero()[:, 0]
         some = ordered[first : first + CAMERAS_AT_ONCE]
-        inside, near = _around_images(some, points_world[out])
-        is_out[out] = ~inside.any(dim=0)
-        rims = near & ~inside
-        on_rims += [(some[row], out[rims[row]]) for row in rims.any(dim=1).nonzero()[:, 0].tolist()]
-    for one, rows in on_rims:
-        left = rows[is_out[rows]]
-        is_out[left[one.contains(*one.project(points_world[left]))]] = False
+        is_out[out] = ~_in_images(some, points_world[out]).any(dim=0)
     return ~is_out.reshape(depth_m.shape)
 
 
-def _around_images(
+def _in_images(
     cameras: Sequence[Camera], points_world: Float[Tensor, "points 3"]
-) -> tuple[Bool[Tensor, "cameras points"], Bool[Tensor, "cameras points"]]:
-    """Which points surely fall into the image of each camera, and which may.
+) -> Bool[Tensor, "cameras points"]:
+    """Which points fall into the image of each camera, as its shutter reads it.
 
-    In between lie those near the rim of the image: a rolling shutter may read them inside or not.
+    What `Camera.project` and `contains` find one by one.
     """
-    matrices, sizes = (each.to(points_world) for each in _projections(cameras))
-    across, down, depth_m = (matrices[:, :, :3] @ points_world.T + matrices[:, :, 3:]).unbind(1)
-    half = sizes / 2
-    aside = torch.maximum(
-        (across / depth_m - half[:, :1]).abs() / half[:, :1],
-        (down / depth_m - half[:, 1:]).abs() / half[:, 1:],
-    )
-    rolls = torch.tensor([one.shutter is not None and one.shutter.is_rolling for one in cameras])
-    margin = torch.where(rolls, 2 * READ_MARGIN, RIM)[:, None]
-    is_ahead = depth_m > NEAREST_M
-    return is_ahead & (aside < 1 - margin), is_ahead & (aside < 1 + margin)
+    inverse = torch.stack([one.camera_from_world for one in cameras]).to(points_world)
+    lens = points_world.new_tensor([[[c.fx_px, c.fy_px], [c.cx_px, c.cy_px]] for c in cameras])
+    focal, middle = lens[:, None].unbind(2)
+    size = points_world.new_tensor([[[c.width_px, c.height_px]] for c in cameras])
+    shutters = [one.shutter or Shutter(twist_per_s=torch.zeros(6)) for one in cameras]
+    across_s = points_world.new_tensor([[one.across_s] for one in shutters])
+    twist = torch.stack([one.twist_per_s for one in shutters]).to(points_world)[:, None]
+    standing = points_world @ inverse[:, :3, :3].mT + inverse[:, None, :3, 3]
+    velocity = -torch.linalg.cross(twist[..., :3].expand_as(standing), standing) - twist[..., 3:]
+    points = standing
+    for number in range(1 + READ_ROUNDS * any(one.is_rolling for one in shutters)):
+        if number:
+            read_s = ((uv / size - 0.5).clamp(-0.5, 0.5) * across_s).sum(-1, keepdim=True)
+            points = standing + read_s * velocity
+        uv = points[..., :2] / points[..., 2:] * focal + middle
+    inside = ((uv >= 0) & (uv < size)).all(dim=-1)
+    return inside & (points[..., 2] > NEAREST_M)
 
 
 def _projections(

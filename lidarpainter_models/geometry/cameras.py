@@ -15,7 +15,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, transform_points
 
-_READ_ROUNDS = 2  # a second guess of where a point is read moves it by less than 0.01 px
+READ_ROUNDS = 2  # a second guess of where a point is read moves it by less than 0.01 px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,7 +148,7 @@ class Camera:
         pixels_uv = self._pixels_of(points)
         if self.shutter is not None and self.shutter.is_rolling:
             standing, velocity = points, _velocity(self.shutter, points)
-            for _ in range(_READ_ROUNDS):
+            for _ in range(READ_ROUNDS):
                 points = standing + self.read_s(pixels_uv)[:, None] * velocity
                 pixels_uv = self._pixels_of(points)
         return pixels_uv, points[:, 2]
@@ -211,7 +211,7 @@ class Camera:
             read = points_camera.reshape(-1, 3)
             centres_uv = self._pixels_of(self.pixel_directions(depth_m.device).reshape(-1, 3))
             after_s, standing = self.read_s(centres_uv)[:, None], read
-            for _ in range(_READ_ROUNDS):
+            for _ in range(READ_ROUNDS):
                 standing = read - after_s * _velocity(self.shutter, standing)
             points_camera = standing.reshape(points_camera.shape)
         world_from_camera = self.world_from_camera.to(torch.float32)

@@ -103,7 +103,6 @@ def test_older_points_fill_only_what_newer_ones_leave_open(camera_at):
     # the older wall stands in front, but the newer one was seen through it
     assert (image.rgb[:, :30, 0] == 1).all()
     assert (image.rgb[:, 34:, 2] == 1).all()
-    assert torch.allclose(image.age_s[:, 34:], torch.tensor(3.0))
 
 
 def test_points_out_of_reach_in_time_are_not_drawn(camera_at):
@@ -118,7 +117,6 @@ def test_ahead_of_the_log_the_newest_points_are_drawn(camera_at):
     older = points(whole_wall(9.0), BLUE, timestamp_ns=-8 * SECOND_NS)
     image = render_lidar(street(older, newest), MovingBoxes([]), camera_at(), 0)
     assert (image.rgb[..., 0] == 1).all()
-    assert torch.allclose(image.age_s, torch.tensor(5.0))
 
 
 def test_newer_points_outweigh_older_ones(camera_at):
