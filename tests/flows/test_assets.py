@@ -1,13 +1,16 @@
 """A run's assets: published once, found, put into another scene, and gone with the run."""
 
 import pytest
+import torch
 from commands import call, refuse, succeed
 from tiny_street import SCENE, SETTINGS
 
 from flows.fleet.asked import Asked
 from flows.fleet.work import make_sequence
 from lidarpainter_models.assets.asset_files import read_asset
+from lidarpainter_models.serving.refusals import RequestError
 from tasks.runs import open_run
+from tasks.serving.library import StoredActors
 from tasks.stored import load_scene
 
 
@@ -66,6 +69,19 @@ def test_an_actor_of_the_library_drives_in_a_scene(own_run, published):  # noqa:
     assert "expected a recorded or styled one" in refuse(
         "assets", "publish", first["run_id"], store=store
     )
+
+
+def test_a_server_takes_the_actor_that_is_nearest_in_class_and_size(own_run, published):  # noqa: ARG001
+    actors, best = StoredActors(own_run.store), best_actor(own_run.store)
+    model = actors.model(best[:8])
+    assert set(actors.names) == {
+        row["asset_id"] for row in rows(own_run.store, kind="actor", style=None)
+    }
+    found = actors.model(actors.nearest(model.category, model.size_m))
+    assert torch.allclose(found.size_m, model.size_m)
+    assert actors.nearest("zeppelin", None) in actors.names  # of no such class: of all
+    with pytest.raises(RequestError, match="asset 'zebra': no asset 'zebra'"):
+        actors.model("zebra")
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,8 @@ def resident_bytes(process):
 
 @pytest.mark.slow
 def test_eight_clients_get_what_one_gets_and_the_server_does_not_grow(tiny_run):
-    with serving(tiny_run, "--time-limit", "300s") as (process, (address,)):
+    words = ("--time-limit", "300s", "--placeholder", "--parked-apart")
+    with serving(tiny_run, *words) as (process, (address,)):
         with grpc.insecure_channel(address) as channel:
             client = wire.client(channel)
             requests = good_requests(client)
