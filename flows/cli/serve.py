@@ -2,7 +2,6 @@
 
 import sys
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +13,7 @@ from lidarpainter_models.devices import check_device
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
-    from catalog.store import Store
+    from flows.serve import ServeRequest
 
 WORDS = """
 runs: Runs to serve, each by its id or the beginning of it, a scene such as pandaset/002 (its newest
@@ -73,17 +72,10 @@ def serve(  # noqa: PLR0913 - the options of a command
         raise ConfigError("--refuse-below needs the confidence that --no-trust leaves out")
     run_ids = tuple(dict.fromkeys(named_run(run) for run in runs))
     check_painter(painter)
-    from catalog.store import existing_store
-    from flows.interruption import starts_anew
-    from flows.serve import ServeRequest, serve_runs
+    from flows.serve import ServeRequest
     from tasks.serving.load import ServedAs
 
-    starts_anew("the server")
-    store = existing_store()
-    if lidar:
-        learn(store, run_ids)
-    serve_runs(
-        store,
+    start(
         ServeRequest(
             runs=run_ids,
             host=host,
@@ -104,19 +96,23 @@ def serve(  # noqa: PLR0913 - the options of a command
             refuse_below=refuse_below,
             log=log,
             allows_shut_down=allow_shut_down,
-        ),
-        opened_at=opened_at,
-        stopped=threading.Event(),
+        )
     )
 
 
-def learn(store: "Store", run_ids: Sequence[str]) -> None:
-    """Learn what the LiDAR of each run's log sees, and show how far that is."""
+def start(request: "ServeRequest") -> None:
+    """Learn what is to be learnt, then answer until a signal comes."""
+    from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.serve import learn_lidars
+    from flows.interruption import starts_anew
+    from flows.serve import learn_lidars, serve_runs
 
-    with shown_progress():
-        learn_lidars(store, run_ids)
+    starts_anew("the server")
+    store = existing_store()
+    if request.has_lidar:
+        with shown_progress():
+            learn_lidars(store, request.runs)
+    serve_runs(store, request, opened_at=opened_at, stopped=threading.Event())
 
 
 def opened_at(address: str, http_address: str | None) -> None:

@@ -28,6 +28,7 @@ from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
 from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.side_by_side import both
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -121,7 +122,8 @@ class ServedScene:
 
     def showing(self, scene: GaussianScene) -> "ServedScene":
         """The same scene changed: what is known of its log, and what was found out, is kept."""
-        other = replace(self, builder=self.builder.showing(scene, self.builder.boxes))
+        boxes = MovingBoxes(scene.tracks)
+        other = replace(self, builder=self.builder.showing(scene, boxes))
         kept = ("_lenses", "_views", "_found", "_distances", "_lock")
         other.__dict__.update({name: getattr(self, name) for name in kept})
         if self.evidence is not None:

@@ -75,5 +75,4 @@ class ScenePool:
 
     def num_changes(self) -> int:
         """How often a scene in memory was changed: what was asked before is another question."""
-        with self._lock:
-            return sum(each.edits.num_changes for each in self._loaded.values())
+        return sum(each.edits.num_changes for each in tuple(self._loaded.values()))

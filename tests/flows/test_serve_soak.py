@@ -44,6 +44,7 @@ def good_requests(client):
             images.append(
                 pb.RGBRenderRequest(
                     camera_intrinsics=spec,
+                    resolution_w=min(spec.resolution_w, 192),
                     frame_start_us=place.timestamp_us,
                     frame_end_us=place.timestamp_us + 1,
                     sensor_pose=pb.PosePair(start_pose=stand, end_pose=stand),

@@ -1,16 +1,20 @@
 """Actors that a client brings along, on a real socket: shown, taken back, or refused."""
 
+from dataclasses import replace
+
 import cv2
 import grpc
 import numpy as np
 import pytest
 from served_street import placed_object, served
 
+from lidarpainter_models.painter.baselines import WarpPainter
 from lidarpainter_models.serving import wire
-from lidarpainter_models.serving.messages import matrix_of
+from lidarpainter_models.serving.messages import matrix_of, read_request
+from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.protos import common_pb2
 from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
-from lidarpainter_models.serving.scene_edits import MOST_COME, with_parked_apart
+from lidarpainter_models.serving.scene_edits import MOST_COME, SceneEdits, with_parked_apart
 
 SCENE = {"scene_id": "street"}
 
@@ -127,3 +131,16 @@ def test_a_parked_car_can_be_left_out_once_it_is_no_part_of_the_street(street):
     bodies = apart.scene.gaussians.body_index
     assert len(bodies) >= len(street.scene.gaussians)
     assert int((bodies > 0).sum()) > int((street.scene.gaussians.body_index > 0).sum())
+
+
+def test_an_edited_scene_is_painted_too(street, view):
+    insertion = street.insertion(view, "newcomer")
+    alone = street.request(view, actors=[placed_object("newcomer", place_of(insertion))])
+    streams = PaintedStreams(painter_of_scene=WarpPainter())
+    edits = SceneEdits(
+        fitted=replace(street.served, streams=streams, is_measured=False), library=street.library
+    )
+    edits.edit(insertion)
+    nobody = edits.shown().frame(read_request(street.request(view, actors=[])), "a").rgb_u8
+    shown = edits.shown().frame(read_request(alone), "b").rgb_u8
+    assert (np.abs(shown.astype(int) - nobody).max(axis=-1) > 8).mean() > 0.02
