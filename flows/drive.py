@@ -19,7 +19,7 @@ from lidarpainter_models.scenes.driving_scene import driven_road
 from lidarpainter_models.serving.closed_loop import STEP_S, ClosedLoop, Moment, num_moments
 from lidarpainter_models.serving.drive_film import film_image, shown_cameras
 from lidarpainter_models.serving.policies import policy_named
-from lidarpainter_models.serving.sensor_client import connected
+from lidarpainter_models.serving.sensor_client import CALL_S, connected
 from tasks.exports.simulator import driven_street
 from tasks.progress import listener
 from tasks.runs import FinishedRun, open_run
@@ -136,7 +136,7 @@ def _renderer(store: Store, finished: FinishedRun, request: DriveRequest) -> Ite
         is_there.set()
 
     def serve() -> None:
-        served = ServeRequest(runs=(finished.run_id,), port=0)
+        served = ServeRequest(runs=(finished.run_id,), port=0, limit_s=CALL_S)
         try:
             serve_runs(store, served, opened_at=opened_at, stopped=stopped)
         except LidarPainterError as error:

@@ -3,7 +3,7 @@
     python scripts/judge_lenses.py FOLDER [--seed 411] [--preset brief]
 
 A street is written into FOLDER and fitted; its held-out frames are served through each lens at one
-size and compared with what stands in the direction of each pixel, the mean over 5 x 5 rays in it.
+size and compared with what stands in the direction of each pixel, the mean over 4 x 4 rays in it.
 Lenses have more or fewer pixels to an angle, and coarse pixels hide errors: so images are also
 compared on one grid of directions, which all of the lenses see, its cells as wide as the pixels of
 the coarsest lens. Cells count by their solid angle.
@@ -38,9 +38,9 @@ from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 WIDTH_PX, HEIGHT_PX, NUM_FRAMES = 320, 180, 12
-RAYS, SAMPLES = 5, 4
+RAYS, SAMPLES = 4, 4
 """Rays along a pixel of a true image; places along a cell of the grid."""
-TRUE_FACE_PX = 2400
+TRUE_FACE_PX = 1600
 """Side of each face of the cube of true pinhole images: finer than the rays of every lens."""
 RIM = 0.04
 """Of the pinhole's image: a lens that is a little narrower sees the grid too."""
@@ -70,32 +70,30 @@ def true_colours(
     street: SyntheticStreet, world_from_camera: torch.Tensor, timestamp_ns: int
 ) -> Callable[[Image], Image]:
     """The true colours in directions of the camera's frame, looked up on six faces of a cube."""
-    turns: list[Image] = []
-    faces = []
+    turns = []
     for axis, sign in ((2, 1), (2, -1), (0, 1), (0, -1), (1, 1), (1, -1)):
-        ahead = sign * np.eye(3)[axis]
-        down = np.eye(3)[1 if axis != 1 else 2]
+        ahead, down = sign * np.eye(3)[axis], np.eye(3)[1 if axis != 1 else 2]
         turns.append(np.stack([np.cross(down, ahead), down, ahead], axis=1))
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(turns[-1])
-        camera = Camera.centred(
-            world_from_camera @ pose,
-            TRUE_FACE_PX / 2,
-            width_px=TRUE_FACE_PX,
-            height_px=TRUE_FACE_PX,
-        )
-        faces.append(street.render(camera, timestamp_ns).rgb.numpy())
+    faces: dict[int, Image] = {}
+
+    def face(number: int) -> Image:
+        if number not in faces:
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[:3, :3] = torch.from_numpy(turns[number])
+            side = {"width_px": TRUE_FACE_PX, "height_px": TRUE_FACE_PX}
+            camera = Camera.centred(world_from_camera @ pose, TRUE_FACE_PX / 2, **side)
+            faces[number] = street.render(camera, timestamp_ns).rgb.numpy()
+        return faces[number]
 
     def colours(rays: Image) -> Image:
-        ahead = np.stack([rays @ turn[:, 2] for turn in turns])
-        nearest = ahead.argmax(axis=0)
+        nearest = np.stack([rays @ turn[:, 2] for turn in turns]).argmax(axis=0)
         found = np.empty((*rays.shape[:-1], 3), np.float32)
-        for number, turn in enumerate(turns):
+        for number in np.unique(nearest).tolist():
             rows = np.nonzero(nearest == number)
-            seen = rays[rows] @ turn
+            seen = rays[rows] @ turns[number]
             at = (seen[:, :2] / seen[:, 2:] + 1) * (TRUE_FACE_PX / 2)
             column, row = np.clip(at.astype(int), 0, TRUE_FACE_PX - 1).T
-            found[rows] = faces[number][row, column]
+            found[rows] = face(number)[row, column]
         return found
 
     return colours
@@ -156,7 +154,8 @@ def served_street(folder: Path, seed: int, name: str) -> tuple[SyntheticStreet, 
     )
     fitted = {view.key for view in seen.views}
     held_out = [view for view in recording.views if view.key not in fitted]
-    return SyntheticStreet(config), served, held_out[1::2]
+    single = replace(config, samples_per_axis=1)  # true images are looked up between its pixels
+    return SyntheticStreet(single), served, held_out[1::2]
 
 
 def shown_image(served: ServedScene, camera: SensorCamera, view, pose: torch.Tensor) -> Image:  # noqa: ANN001

@@ -17,6 +17,7 @@ def serving(run, *words):
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
+    assert process.stdout is not None
     with process:
         try:
             yield (
