@@ -106,11 +106,11 @@ def _in_images(
     twist = torch.stack([one.twist_per_s for one in shutters]).to(points_world)[:, None]
     standing = points_world @ inverse[:, :3, :3].mT + inverse[:, None, :3, 3]
     velocity = -torch.linalg.cross(twist[..., :3].expand_as(standing), standing) - twist[..., 3:]
-    points = standing
-    for number in range(1 + READ_ROUNDS * any(one.is_rolling for one in shutters)):
-        if number:
-            read_s = ((uv / size - 0.5).clamp(-0.5, 0.5) * across_s).sum(-1, keepdim=True)
-            points = standing + read_s * velocity
+    points, rounds = standing, READ_ROUNDS * any(one.is_rolling for one in shutters)
+    uv = points[..., :2] / points[..., 2:] * focal + middle
+    for _ in range(rounds):
+        read_s = ((uv / size - 0.5).clamp(-0.5, 0.5) * across_s).sum(-1, keepdim=True)
+        points = standing + read_s * velocity
         uv = points[..., :2] / points[..., 2:] * focal + middle
     inside = ((uv >= 0) & (uv < size)).all(dim=-1)
     return inside & (points[..., 2] > NEAREST_M)
