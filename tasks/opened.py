@@ -51,11 +51,25 @@ def opened(spec: RunSpec) -> OpenedRun:
     """The run of a spec, opened once in a process as long as its scene stays as it is.
 
     Raises:
-        SceneError: the scene is not there, is not complete, or lacks a camera.
+        SceneError: the scene is not there, is not complete, has no poses, or lacks a camera.
         ConfigError: the split leaves nothing to train on, or the device is not there.
     """
-    scene = open_scene(open_store(spec.store_path), spec.split.scene_id)
-    return _opened(spec, scene)
+    return _opened(spec, open_posed(open_store(spec.store_path), spec.split.scene_id))
+
+
+def open_posed(store: Store, scene_id: str) -> DrivingScene:
+    """A scene of the store of which it is known where the car drove.
+
+    Raises:
+        SceneError: it is not there, not complete, or has no poses.
+    """
+    scene = open_scene(store, scene_id)
+    if not scene.has_poses:
+        raise SceneError(
+            f"scene {scene_id} has no poses, expected to know where the car drove: "
+            f"`lidarpainter localise {scene_id}` finds it"
+        )
+    return scene
 
 
 def open_scene(store: Store, scene_id: str) -> DrivingScene:

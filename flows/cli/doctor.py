@@ -1,7 +1,7 @@
 """`lidarpainter doctor`: is this machine, this scene or this dataset fit for work?"""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,7 +49,14 @@ def doctor(
     tell_findings("subject", subject or "environment", findings, as_json=as_json)
 
 
-def tell_findings(kind: str, subject: str, findings: Sequence[Any], *, as_json: bool) -> None:
+def tell_findings(
+    kind: str,
+    subject: str,
+    findings: Sequence[Any],
+    *,
+    as_json: bool,
+    more: Mapping[str, Any] | None = None,
+) -> None:
     """Print what checks found, as a table or one object; a failure ends the command with code 2.
 
     Args:
@@ -57,13 +64,14 @@ def tell_findings(kind: str, subject: str, findings: Sequence[Any], *, as_json: 
         subject: what was looked at.
         findings: each with `name`, `verdict` and `detail`.
         as_json: whether one object is printed.
+        more: further entries of the object.
     """
     is_fit = all(finding.verdict != "fail" for finding in findings)
     rows = [(finding.name, finding.verdict, finding.detail) for finding in findings]
     columns = ("name", "verdict", "detail")
     if as_json:
         found = [dict(zip(columns, row, strict=True)) for row in rows]
-        print_json({kind: subject, "is_fit": is_fit, "findings": found})
+        print_json({**(more or {}), kind: subject, "is_fit": is_fit, "findings": found})
     else:
         print_table(subject, ["what", *columns[1:]], rows, num_text_columns=3)
     if not is_fit:

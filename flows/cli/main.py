@@ -29,7 +29,9 @@ from flows.cli import (
     export,
     fleet,
     ingest,
+    label,
     lidar_model,
+    localise,
     measure,
     painter,
     reconstruct,
@@ -99,6 +101,8 @@ app.command("drive")(drive.drive)
 app.command("check-bundle")(bundle.check_bundle)
 app.command("stylize")(stylize.stylize)
 app.command("lidar-model")(lidar_model.lidar_model)
+app.command("localise")(localise.localise)
+app.command("label")(label.label)
 app.command("edit")(edit.edit)
 app.command("view")(view.view)
 app.command("serve")(serve.serve)

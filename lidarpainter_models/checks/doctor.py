@@ -117,6 +117,8 @@ MAX_CAMERA_LAG_S = 0.15
 """A camera takes its image while the LiDAR turns; farther apart is another frame's image."""
 MAX_RIG_SPREAD_M = 0.15
 _NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
+_NEED_NO_POSES = ("stored content", "licence", "ego poses", "timestamps", "camera sync", "images")
+"""Checks of a scene of which nobody knows where the car drove."""
 _MIN_STEP_M = 0.2
 """From frame to frame; the poses of a car that stands jitter by less."""
 
@@ -147,7 +149,7 @@ def check_scene(
     checks: tuple[tuple[str, Callable[[DrivingScene], tuple[Verdict, str]], bool], ...] = (
         ("stored content", check_content, True),
         ("licence", check_licence, True),
-        ("ego poses", check_ego_poses, True),
+        ("ego poses", check_ego_poses if scene.has_poses else _lacks_poses, True),
         ("timestamps", check_timestamps, True),
         ("camera sync", check_camera_sync, has_lidar),
         ("camera rig", check_camera_rig, True),
@@ -167,7 +169,11 @@ def check_scene(
         ("own boxes", check_own_boxes, True),
         ("unboxed traffic", check_traffic, has_lidar),
     )
-    found = [_run(name, check, scene, looking_at) for name, check, is_due in checks if is_due]
+    found = [
+        _run(name, check, scene, looking_at)
+        for name, check, is_due in checks
+        if is_due and (scene.has_poses or name in _NEED_NO_POSES)
+    ]
     if not has_lidar:
         without = "none: a fit takes its points from images, and what needs points is not checked"
         found.append(Check(name="LiDAR", verdict="warn", detail=without))
@@ -242,6 +248,11 @@ def check_ego_poses(scene: DrivingScene) -> tuple[Verdict, str]:
                 f"{_frame_after(scene, int(change.argmax()))}"
             )
     return "ok", detail
+
+
+def _lacks_poses(scene: DrivingScene) -> tuple[Verdict, str]:
+    command = f"lidarpainter localise {scene.dataset}/{scene.sequence}"
+    return "fail", f"none were recorded: `{command}` finds them; what needs them is not checked"
 
 
 def check_timestamps(scene: DrivingScene) -> tuple[Verdict, str]:

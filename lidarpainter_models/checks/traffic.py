@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from lidarpainter_models.checks.seen_space import SeenSpace
 from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -26,7 +27,6 @@ MOST_DRIFT_M = 3.0
 _REACH_M = 35.0
 _APART_S = (0.4, 1.5)
 _NUM_SWEEPS = 8
-_CELL_DEG = 0.5
 _CELL_M = 0.4
 _OVER_ROAD_M = (0.3, 3.0)
 _BEYOND_M, _BEYOND_SHARE = 1.0, 0.05
@@ -124,24 +124,7 @@ def _is_passed(
     scene: DrivingScene, sweep: Sweep, points_m: Float[Tensor, "points 3"]
 ) -> Bool[np.ndarray, " points"]:
     """Which places the beams of a sweep have passed through."""
-    rows, columns = round(180 / _CELL_DEG), round(360 / _CELL_DEG)
-    range_m, row, column = _directions(scene.read_column(sweep, "xyz_m").double().numpy(), sweep)
-    image = np.full((rows, columns), np.inf)
-    np.minimum.at(image, (row, column), range_m)
-    nearest = minimum_filter(image, 3, mode="wrap")
-    range_m, row, column = _directions(points_m.double().numpy(), sweep)
-    beyond_m = range_m * (1 + _BEYOND_SHARE) + _BEYOND_M
-    return np.isfinite(image[row, column]) & (nearest[row, column] > beyond_m)
-
-
-def _directions(
-    points_m: Float[np.ndarray, "points 3"], sweep: Sweep
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Range, row and column of points in the image of what a sweep saw."""
-    away_m = points_m - sweep.world_from_lidar[:3, 3].numpy()
-    range_m = np.maximum(np.linalg.norm(away_m, axis=1), 1e-6)
-    elevation_deg = np.degrees(np.arcsin(np.clip(away_m[:, 2] / range_m, -1, 1)))
-    azimuth_deg = np.degrees(np.arctan2(away_m[:, 1], away_m[:, 0]))
-    row = np.minimum(((elevation_deg + 90) / _CELL_DEG).astype(int), round(180 / _CELL_DEG) - 1)
-    column = ((azimuth_deg + 180) / _CELL_DEG).astype(int) % round(360 / _CELL_DEG)
-    return range_m, row, column
+    seen_m = scene.read_column(sweep, "xyz_m").double().numpy()
+    space = SeenSpace(seen_m, sweep.world_from_lidar[:3, 3].numpy())
+    places_m = points_m.double().numpy()
+    return space.passed(places_m, beyond_m=_BEYOND_M, beyond_share=_BEYOND_SHARE)

@@ -32,6 +32,7 @@ from lidarpainter_models.scenes.records import (
     Sweep,
     SweepPoints,
 )
+from lidarpainter_models.scenes.schema import NO_POSES, POSES
 from lidarpainter_models.scenes.shutters import recorded_shutters
 from lidarpainter_models.scenes.stored import Fetch, StoredScene
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
@@ -90,6 +91,11 @@ class DrivingScene:
     def global_from_world(self) -> Float[Tensor, "4 4"]:
         """The dataset's own frame from the world, float64."""
         return torch.tensor(self.manifest["global_from_world"], dtype=torch.float64).reshape(4, 4)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether it is known where the car drove; else all is in the car's frame of its time."""
+        return self.manifest.get(POSES) != NO_POSES
 
     def frame_position(self, frame_index: int) -> int:
         """Position of a frame in `frame_indices` and its tensors."""

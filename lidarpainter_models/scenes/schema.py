@@ -19,6 +19,10 @@ MANIFEST_NAME = "manifest.json"
 ARRAYS_NAME = "scene.zarr"
 GLOBAL_FRAME = "global_frame"
 """Entry of a manifest that may be left out: scenes with the same name in it share that frame."""
+POSES, NO_POSES, LOCALISED = "poses", "none", "localised"
+"""Entry of a manifest that may be left out where poses were recorded, and what it may say."""
+LABELLED = "labelled"
+"""Entry of a manifest that may be left out: actors whose boxes were found, each with its score."""
 MAX_NAME_LENGTH = 128
 """File systems allow a folder 255 bytes, and names are parts of longer ones."""
 NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_LENGTH - 1}}}")

@@ -14,6 +14,7 @@ from lidarpainter_models.geometry.transforms import interpolate_rigid_track, tra
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, Sweep, SweepPoints
+from lidarpainter_models.scenes.rewriting import stored_boxes
 
 JPEG_QUALITY = 95
 
@@ -119,24 +120,5 @@ def read_frame(scene: DrivingScene, frame_index: int) -> Frame:
             Turn(sweep=sweep, points=scene.read_sweep(sweep), semantics=classes[number])
             for number, sweep in enumerate(sweeps)
         ),
-        boxes=tuple(_boxes(scene, frame_index)),
+        boxes=tuple(stored_boxes(scene, frame_index)),
     )
-
-
-def _boxes(scene: DrivingScene, frame_index: int) -> list[BoxRecord]:
-    found = []
-    for track in scene.tracks:
-        for row in (track.frame_indices == frame_index).nonzero()[:, 0].tolist():
-            length_m, width_m, height_m = track.size_m.tolist()
-            found.append(
-                BoxRecord(
-                    actor_id=track.actor_id,
-                    category=track.category,
-                    timestamp_ns=int(track.timestamps_ns[row]),
-                    world_from_box=track.world_from_box[row],
-                    size_m=(length_m, width_m, height_m),
-                    is_moving=track.is_moving,
-                    num_points=int(track.num_points[row]),
-                )
-            )
-    return found

@@ -14,7 +14,7 @@ from lidarpainter_models.stress.spoiling import (
     write_spoilt,
 )
 from tasks.ingest.ingest import STAGE, record_scene, writing
-from tasks.opened import open_scene
+from tasks.opened import open_posed, open_scene
 from tasks.progress import listener
 from tasks.stages import stage_task
 
@@ -23,7 +23,7 @@ from tasks.stages import stage_task
 def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> str:
     """Write a stored scene anew with a fault, unless that is there; returns its scene id."""
     store = open_store(store_path)
-    scene = open_scene(store, scene_id)
+    scene = open_posed(store, scene_id)
     name = spoilt_id(scene, cause, level)
     if not _is_stored(store, name, spoilt_from(scene, cause, level)):
         with writing(store, name):

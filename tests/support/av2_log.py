@@ -16,12 +16,12 @@ import torch
 from drawn_streets import drawn_street
 from nuscenes_log import FAR_AWAY
 
+from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     quaternion_from_rotation,
     transform_points,
 )
-from lidarpainter_models.readers.source_logs.drive_poses import poses_at
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
 

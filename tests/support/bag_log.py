@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     quaternion_from_rotation,
 )
-from lidarpainter_models.readers.source_logs.drive_poses import poses_at
 
 CAMERA, LIDAR = "cameras/{}/image/compressed", "lidars/{}/points"
 WORLD, CAR = "map", "base_link"

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
-from lidarpainter_models.readers.source_logs.drive_poses import poses_at, turned_about_up
+from lidarpainter_models.readers.source_logs.drive_poses import turned_about_up
 from lidarpainter_models.scenes.image_bytes import decode_image
 
 DATE, DRIVE, SEQUENCE = "2011_09_26", "2011_09_26_drive_0005_sync", "0007"

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.readers.av2.sweeps import (
     LASERS,
@@ -35,8 +36,12 @@ from lidarpainter_models.readers.av2.sweeps import (
     is_upper_first,
     read_sweep,
 )
-from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame, poses_at
-from lidarpainter_models.readers.source_logs.feather_tables import Kind, read_feather, stated_poses
+from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame
+from lidarpainter_models.readers.source_logs.feather_tables import (
+    Kind,
+    read_feather,
+    stated_poses,
+)
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.readers.source_logs.sweep_frames import nearest_images

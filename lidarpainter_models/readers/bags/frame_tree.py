@@ -8,9 +8,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.readers.bags.messages import BagTransform
-from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, poses_at
+from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S
 
 MAX_GAP_NS = NS_PER_S
 """Between two poses of a moving frame; a car drives metres meanwhile."""

@@ -70,7 +70,10 @@ def proposed_rig(survey: BagSurvey) -> Proposal:
     frames = [survey.topics[sensor.topic].frame for sensor in sensors]
     ego, world = _car_frame(tree, frames[0] if frames else "")
     if frames and ego == world:
-        missing.append(f"no pose of the car: nothing moves {frames[0] or 'its sensors'} in a frame")
+        missing.append(
+            f"no pose of the car: nothing moves {frames[0] or 'its sensors'} in a frame (with the "
+            "rig given as --map it is read without, and `lidarpainter localise` finds them)"
+        )
     for sensor, frame in zip(sensors, frames, strict=True):
         if not tree.are_tied(frame, ego):
             missing.append(

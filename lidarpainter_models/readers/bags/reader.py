@@ -20,6 +20,7 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.timed_poses import compensated
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.readers.bags.chunks import BagMessage, bag_files, bag_messages
 from lidarpainter_models.readers.bags.clouds import BagPoints, points_of
@@ -31,10 +32,10 @@ from lidarpainter_models.readers.bags.rig import RigCamera, RigLidar, RigSensor,
 from lidarpainter_models.readers.bags.survey import survey_bag
 from lidarpainter_models.readers.bags.video import BagVideo
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame
-from lidarpainter_models.readers.source_logs.sweep_frames import compensated
 from lidarpainter_models.readers.source_logs.swept_boxes import seen_records
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
+from lidarpainter_models.scenes.schema import NO_POSES, POSES
 from lidarpainter_models.scenes.validation import jpeg_header_size
 from lidarpainter_models.scenes.writer import SceneHeader
 
@@ -72,7 +73,9 @@ class BagLog:
         self.global_from_world = level_frame(self._pose(self._rig.ego, int(first_ns[0])))
         self._world_from_global = invert_rigid(self.global_from_world)
         self.header = SceneHeader(
-            licence=self._rig.licence, global_from_world=self.global_from_world
+            licence=self._rig.licence,
+            global_from_world=self.global_from_world,
+            more={} if self.is_drive else {POSES: NO_POSES},
         )
         self._lenses: dict[str, BagLens] = {c.name: self._lens(c) for c in self._rig.cameras}
         self._digest, self._num_messages = hashlib.sha256(), 0

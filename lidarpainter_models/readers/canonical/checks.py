@@ -52,6 +52,7 @@ def read_foreign_manifest(folder: Path) -> dict[str, Any]:
             "older one"
         )
     _require_texts(manifest, str(file))
+    _require_origins(manifest, str(file))
     pose = manifest.get("global_from_world")
     if not (isinstance(pose, list) and len(pose) == 16 and all(map(_is_number, pose))):
         raise DataError(f"{file}: global_from_world is no list of 16 numbers")
@@ -98,6 +99,18 @@ def _require_texts(manifest: dict[str, Any], where: str) -> None:
     if not isinstance(manifest.get("semantic_classes"), dict):
         raise DataError(f"{where}: semantic_classes are no names by class number")
     require_classes(manifest["semantic_classes"], f"{where}: semantic_classes")
+
+
+def _require_origins(manifest: dict[str, Any], where: str) -> None:
+    """What is said of where poses and boxes come from."""
+    known = (schema.NO_POSES, schema.LOCALISED)
+    if manifest.get(schema.POSES, known[0]) not in known:
+        raise DataError(f"{where}: {schema.POSES} says none of {', '.join(known)}")
+    scores = manifest.get(schema.LABELLED, {})
+    if not (isinstance(scores, dict) and all(map(_is_number, scores.values()))):
+        raise DataError(f"{where}: {schema.LABELLED} is no object of scores by actor")
+    for name in scores:
+        require_name(name, f"{where}: {schema.LABELLED}")
 
 
 def _require_files(files: object, folder: Path) -> None:

@@ -25,6 +25,7 @@ from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import image_of_row
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord, SweepPoints
+from lidarpainter_models.scenes.rewriting import FURTHER_ENTRIES
 from lidarpainter_models.scenes.stored import StoredScene
 from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_name, require_pose
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -33,8 +34,6 @@ MAX_SPEED_MPS = 500.0
 """Of any vehicle: eight times what the doctor takes for a car."""
 _MAX_JPEG_BYTES = 64_000_000
 _MAX_SWEEP_POINTS = 10_000_000
-_FURTHER_ENTRIES = (schema.GLOBAL_FRAME, "generator", "stress")
-"""Of a manifest, taken over as they are; by the latter two a drawn or spoilt street is known."""
 _STRETCHES = (("cameras", "num_bytes", "image_bytes"), ("sweeps", "num_points", "point_xyz_m"))
 """Tables whose rows are stretches of an array, and the column with their lengths."""
 
@@ -120,7 +119,7 @@ class ForeignScene:
             semantic_classes={
                 int(number): name for number, name in self.manifest["semantic_classes"].items()
             },
-            more={k: self.manifest[k] for k in _FURTHER_ENTRIES if k in self.manifest},
+            more={k: self.manifest[k] for k in FURTHER_ENTRIES if k in self.manifest},
         )
 
     def provenance(self) -> dict[str, object]:

@@ -28,13 +28,13 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.timed_poses import compensated, poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.readers.kitti.drives import open_drive
 from lidarpainter_models.readers.kitti.texts import KittiBox
-from lidarpainter_models.readers.source_logs.drive_poses import level_frame, poses_at
+from lidarpainter_models.readers.source_logs.drive_poses import level_frame
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_frames
-from lidarpainter_models.readers.source_logs.sweep_frames import compensated
 from lidarpainter_models.readers.source_logs.swept_boxes import with_motion
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.image_bytes import as_jpeg

@@ -5,14 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.transforms import (
-    interpolate_rigid,
-    rigid_from_rotation,
-    rotation_from_quaternion,
-)
+from lidarpainter_models.geometry.timed_poses import poses_at
+from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_quaternion
 
 NS_PER_S = 1_000_000_000
 MIN_UNIT, MAX_UNIT = 0.99, 1.01
@@ -24,21 +21,6 @@ def pose_at(
 ) -> Float[Tensor, "4 4"]:
     """A pose between the recorded ones; before the first and after the last the motion goes on."""
     return poses_at(global_from_body, np.array(timestamps_ns), np.array([timestamp_ns]))[0]
-
-
-def poses_at(
-    global_from_body: Float[Tensor, "frames 4 4"],
-    timestamps_ns: Int64[np.ndarray, " frames"],
-    queries_ns: Int64[np.ndarray, " queries"],
-) -> Float[Tensor, "queries 4 4"]:
-    """Poses between the recorded ones, whose times ascend; beyond their ends the motion goes on."""
-    if len(timestamps_ns) == 1:
-        return global_from_body.expand(len(queries_ns), 4, 4)
-    after = np.searchsorted(timestamps_ns, queries_ns).clip(1, len(timestamps_ns) - 1)
-    start_ns, end_ns = timestamps_ns[after - 1], timestamps_ns[after]
-    fraction = torch.from_numpy((queries_ns - start_ns) / (end_ns - start_ns))
-    rows = torch.from_numpy(after)
-    return interpolate_rigid(global_from_body[rows - 1], global_from_body[rows], fraction)
 
 
 def level_frame(global_from_ego: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -174,13 +174,16 @@ def test_bag_without_poses_or_boxes_is_read_in_the_frame_of_the_car(street, tmp_
 
     file = written(tmp_path / "bags/drive.mcap", BagScene(street), sensors_alone)
     proposed = propose_rig(file)
-    assert proposed["missing"] == ["no pose of the car: nothing moves main_pandar64 in a frame"]
+    (missing,) = proposed["missing"]
+    assert missing.startswith("no pose of the car: nothing moves main_pandar64 in a frame")
+    assert "lidarpainter localise" in missing
     with pytest.raises(DataError, match="no pose of the car"):
         read(file.parent, "drive", tmp_path / "refused")
     rig = tmp_path / "rig.toml"
     rig.write_text(proposed["rig"])
     scene = read_as(file.parent, "drive", rig, tmp_path / "store")
     assert scene.tracks == ()
+    assert not scene.has_poses
     assert float((scene.world_from_ego - scene.world_from_ego[0]).abs().max()) == 0.0
     assert len(scene.views) == len(street.views)
 

@@ -1,0 +1,89 @@
+"""A log that says neither where the car drove nor who is where: `localise`, `label`."""
+
+import pytest
+from commands import call, refuse, succeed
+from drawn_streets import drawn_street
+from tiny_street import TINY, tiny_street
+
+from catalog.store import open_store
+from lidarpainter_models.lidar.localised import write_without_poses
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.schema import LABELLED, LOCALISED, POSES
+from lidarpainter_models.synthetic import RigLidar
+from lidarpainter_models.synthetic.sequence import record_street
+from tasks.ingest.ingest import record_scene
+
+STREET = "synthetic/street-0012"
+STRIPPED = "synthetic/stripped"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    store = open_store(tmp_path_factory.mktemp("unlabelled") / "store")
+    store.make()
+    config = tiny_street(12, num_frames=10, lidar=RigLidar(columns=900))
+    path = record_street(drawn_street(config), store.root)
+    record_scene(store, path)
+    record_scene(store, write_without_poses(DrivingScene.open(path), store.root, "stripped"))
+    return store
+
+
+def scene_of(store, scene_id):
+    return DrivingScene.open(store.scene_folder(scene_id))
+
+
+def test_what_has_no_poses_is_refused_with_the_command_that_finds_them(store):
+    for words in (("reconstruct", STRIPPED, *TINY), ("label", STRIPPED)):
+        line = refuse(*words, store=store)
+        assert f"`lidarpainter localise {STRIPPED}` finds it" in line
+    answer = call("doctor", STRIPPED, "--json", store=store)
+    assert answer.code == 2
+    (poses,) = [one for one in answer.json["findings"] if one["name"] == "ego poses"]
+    assert f"lidarpainter localise {STRIPPED}" in poses["detail"]
+
+
+def test_poses_are_found_and_then_who_moves(store):
+    answer = call("localise", STRIPPED, "--json", store=store)
+    assert answer.json["scene"] == f"{STRIPPED}-localised"
+    assert answer.json["way_m"] > 3
+    assert answer.code == (0 if answer.json["is_fit"] else 2)
+    found = scene_of(store, f"{STRIPPED}-localised")
+    truth = scene_of(store, STREET)
+    assert found.manifest[POSES] == LOCALISED
+    assert found.has_poses
+    off_m = (found.world_from_ego - truth.world_from_ego)[-1, :3, 3].norm()
+    assert float(off_m) < 0.05
+    artefacts = len(store.tables.rows("artefacts"))
+    shown = call("localise", STRIPPED, store=store)
+    assert "way_m" in shown.out
+    assert len(store.tables.rows("artefacts")) == artefacts  # it was there
+
+    written = succeed("label", f"{STRIPPED}-localised", "--json", store=store).json
+    assert written["written"] == f"{STRIPPED}-localised-labelled"
+    labelled = scene_of(store, written["written"])
+    assert labelled.manifest[POSES] == LOCALISED
+    assert {track.actor_id for track in labelled.tracks} == set(labelled.manifest[LABELLED])
+    assert len(labelled.tracks) == len(written["actors"]) >= 2
+    assert all(track.is_moving for track in labelled.tracks)
+    assert "who moves" in succeed("label", written["written"], store=store).out
+
+
+def test_poses_and_boxes_that_are_there_are_judged_and_kept(store):
+    told = succeed("localise", STREET, "--json", store=store).json
+    assert told["translation_share"] < 0.01
+    assert not store.scene_folder(f"{STREET}-localised").exists()
+    rows = succeed("label", STREET, "--json", store=store).json
+    assert rows["written"] is None
+    assert any(row["found"] and row["given"] for row in rows["actors"])
+    made = succeed("label", STREET, "--complete", "--as", "more", "--json", store=store).json
+    assert made["written"] == "synthetic/more"
+    before, after = scene_of(store, STREET), scene_of(store, "synthetic/more")
+    kept = {track.actor_id for track in before.tracks}
+    assert kept <= {track.actor_id for track in after.tracks}
+    assert after.manifest["generator"] == before.manifest["generator"]
+
+
+def test_a_scene_of_another_origin_is_not_replaced(store):
+    line = refuse("localise", STREET, "--as", "stripped", store=store)
+    assert "was not made of synthetic/street-0012 by localise; it was kept" in line
+    assert not scene_of(store, STRIPPED).has_poses
