@@ -18,7 +18,7 @@ from catalog.store import open_store
 from lidarpainter_models.lidar.movers import FoundActor, box_of, find_movers
 from lidarpainter_models.lidar.odometry import drive_of, path_difference
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 from tasks.opened import open_scene
 
 LEAST_MPS, NEAR_M, LEAST_POINTS, LEAST_FRAMES = 1.0, 40.0, 30, 3
@@ -45,17 +45,12 @@ def counted_rows(scene: DrivingScene, track: ActorTrack) -> list[int]:
 
 def offsets_m(track: ActorTrack, rows: list[int], found: ActorTrack) -> np.ndarray:
     """How far a found track's centre is from an actor's in some of its frames; inf without one."""
-    apart = []
-    for row in rows:
-        frame = int(track.frame_indices[row])
-        own = (found.frame_indices == frame).nonzero()[:, 0]
-        if not len(own):
-            apart.append(np.inf)
-            continue
-        at_ns = int(found.timestamps_ns[own[0]])
-        truth = track.pose_at(at_ns)[:2, 3]
-        apart.append(float((found.world_from_box[own[0], :2, 3] - truth).norm()))
-    return np.array(apart)
+    frames = found.frame_indices.tolist()
+    own = [frames.index(frame) if frame in frames else -1 for frame in track.frame_indices[rows]]
+    times_ns = found.timestamps_ns[own]
+    truth = TrackPoses.of([track]).at(torch.zeros_like(times_ns), times_ns)[:, :2, 3]
+    apart_m = (found.world_from_box[own, :2, 3] - truth).norm(dim=1).numpy()
+    return np.where(np.array(own) < 0, np.inf, apart_m)
 
 
 def judge_movers(scene: DrivingScene, found: list[FoundActor]) -> dict[str, object]:

@@ -21,9 +21,9 @@ from lidarpainter_models.lidar.moving_points import Clump
 LEAST_FRAMES, LEAST_WAY_M, LEAST_SPEED_MPS = 5, 1.0, 0.5
 LEAST_STRAIGHT, MOST_JITTER_M = 0.6, 0.6
 """Of a way, its ends' distance over its length; and how far clumps lie from it (RMS)."""
-LEAST_TALL_M = 0.5
+LEAST_TALL_M, MOST_HANGING_M = 0.5, 1.0
 """Of what is seen, from its lowest point to its highest; less is a lone ring at the edge of what
-stands."""
+stands; and of its lowest point over the ground."""
 HEADING_MPS = 0.7
 """Who goes slower points where it pointed when it went faster."""
 ROUNDS = 3
@@ -65,7 +65,7 @@ class Mover:
 
 def boxed(clumps: Sequence[Clump]) -> Mover | None:
     """The boxes of a track; None where it does not move, or moves as nothing does."""
-    if len(clumps) < LEAST_FRAMES or _tall_m(clumps) < LEAST_TALL_M:
+    if len(clumps) < LEAST_FRAMES or not _stands(clumps):
         return None
     times_s = np.array([clump.time_ns for clump in clumps]) * 1e-9
     seen_m = np.array([middle(clump) for clump in clumps])
@@ -97,9 +97,11 @@ def boxed(clumps: Sequence[Clump]) -> Mover | None:
     )
 
 
-def _tall_m(clumps: Sequence[Clump]) -> float:
-    """How tall is what is seen in those frames that show most of it."""
-    return float(np.percentile([np.ptp(clump.points_m[:, 2]) for clump in clumps], 80))
+def _stands(clumps: Sequence[Clump]) -> bool:
+    """Whether what is seen is tall enough and reaches down towards the ground."""
+    tall_m = np.percentile([np.ptp(clump.points_m[:, 2]) for clump in clumps], 80)
+    hangs_m = np.median([clump.points_m[:, 2].min() - clump.ground_m for clump in clumps])
+    return bool(tall_m >= LEAST_TALL_M and hangs_m <= MOST_HANGING_M)
 
 
 def smoothed(

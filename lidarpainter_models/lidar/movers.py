@@ -15,7 +15,7 @@ from lidarpainter_models.lidar.mover_boxes import Mover, boxed
 from lidarpainter_models.lidar.mover_tracks import LONGEST_UNSEEN_S, tracked
 from lidarpainter_models.lidar.moving_points import Clump, moving_clumps
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 BESIDE_M = 0.5
 """Pieces of one thing: the centre of one lies in the box of the other, grown by this."""
@@ -71,12 +71,11 @@ def box_of(track: ActorTrack, tracks: Sequence[ActorTrack]) -> ActorTrack | None
 def _together(track: ActorTrack, other: ActorTrack) -> float:
     """Share of a track's times at which the other's centre is within half its own length."""
     reach_m = BESIDE_M + float(torch.maximum(track.size_m, other.size_m)[:2].max()) / 2
-    near = 0
-    for time_ns, pose in zip(track.timestamps_ns.tolist(), track.world_from_box, strict=True):
-        if other.is_present(time_ns):
-            away_m = other.pose_at(time_ns)[:2, 3] - pose[:2, 3]
-            near += float(away_m.norm()) < reach_m
-    return near / len(track.timestamps_ns)
+    poses, times_ns = TrackPoses.of([other]), track.timestamps_ns
+    is_there = poses.present(times_ns[:, None])[:, 0]
+    others = poses.at(torch.zeros_like(times_ns), times_ns)[:, :2, 3]
+    is_near = (others - track.world_from_box[:, :2, 3]).norm(dim=1) < reach_m
+    return float((is_there & is_near).double().mean())
 
 
 def _joined(movers: list[Mover]) -> list[Mover]:

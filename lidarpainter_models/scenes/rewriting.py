@@ -1,6 +1,6 @@
 """Write a stored scene anew, with something changed: where it was recorded, or who is boxed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +8,7 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME, LABELLED, POSES
+from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 
 FURTHER_ENTRIES = (GLOBAL_FRAME, POSES, LABELLED, "generator", "stress")
@@ -82,25 +83,25 @@ def stored_content(scene: DrivingScene, frame_index: int) -> FrameContent:
             )
             for sweep, of_sweep in zip(sweeps, classes, strict=True)
         ],
-        boxes=stored_boxes(scene, frame_index),
+        boxes=track_boxes(scene.tracks, frame_index),
     )
 
 
-def stored_boxes(scene: DrivingScene, frame_index: int) -> list[BoxRecord]:
-    """The boxes of a frame, each with the size of its track."""
+def track_boxes(tracks: Sequence[ActorTrack], frame_index: int) -> list[BoxRecord]:
+    """The boxes of some tracks in a frame, each with the size of its track."""
     found = []
-    for track in scene.tracks:
-        for row in (track.frame_indices == frame_index).nonzero()[:, 0].tolist():
-            length_m, width_m, height_m = track.size_m.tolist()
-            found.append(
-                BoxRecord(
-                    actor_id=track.actor_id,
-                    category=track.category,
-                    timestamp_ns=int(track.timestamps_ns[row]),
-                    world_from_box=track.world_from_box[row],
-                    size_m=(length_m, width_m, height_m),
-                    is_moving=track.is_moving,
-                    num_points=int(track.num_points[row]),
-                )
+    for track in tracks:
+        length_m, width_m, height_m = track.size_m.tolist()
+        found += [
+            BoxRecord(
+                actor_id=track.actor_id,
+                category=track.category,
+                timestamp_ns=int(track.timestamps_ns[row]),
+                world_from_box=track.world_from_box[row],
+                size_m=(length_m, width_m, height_m),
+                is_moving=track.is_moving,
+                num_points=int(track.num_points[row]),
             )
+            for row in (track.frame_indices == frame_index).nonzero()[:, 0].tolist()
+        ]
     return found

@@ -14,7 +14,7 @@ from lidarpainter_models.geometry.transforms import interpolate_rigid_track, tra
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, Sweep, SweepPoints
-from lidarpainter_models.scenes.rewriting import stored_boxes
+from lidarpainter_models.scenes.rewriting import stored_content
 
 JPEG_QUALITY = 95
 
@@ -100,25 +100,18 @@ class Frame:
 
 def read_frame(scene: DrivingScene, frame_index: int) -> Frame:
     """Read a frame of a stored scene."""
-    position = scene.frame_position(frame_index)
-    views = [view for view in scene.views if view.frame_index == frame_index]
-    semantics = scene.read_semantics(frame_index)
-    sweeps = scene.sweeps_of(frame_index)
-    counts = [sweep.num_points for sweep in sweeps]
-    classes = [None] * len(sweeps) if semantics is None else list(semantics.split(counts))
+    content = stored_content(scene, frame_index)
     return Frame(
         frame_index=frame_index,
-        position=position,
-        timestamp_ns=int(scene.frame_timestamps_ns[position]),
-        world_from_ego=scene.world_from_ego[position],
+        position=scene.frame_position(frame_index),
+        timestamp_ns=content.timestamp_ns,
+        world_from_ego=content.world_from_ego,
         pose_at=partial(interpolate_rigid_track, scene.frame_timestamps_ns, scene.world_from_ego),
         log_end_ns=int(scene.frame_timestamps_ns[-1]),
-        shots=tuple(
-            Shot(record=scene.image_record(view), jpeg=scene.read_jpeg(view)) for view in views
-        ),
+        shots=tuple(Shot(record=image.record, jpeg=image.jpeg) for image in content.images),
         turns=tuple(
-            Turn(sweep=sweep, points=scene.read_sweep(sweep), semantics=classes[number])
-            for number, sweep in enumerate(sweeps)
+            Turn(sweep=sweep, points=read.points, semantics=read.semantics)
+            for sweep, read in zip(scene.sweeps_of(frame_index), content.sweeps, strict=True)
         ),
-        boxes=tuple(stored_boxes(scene, frame_index)),
+        boxes=tuple(content.boxes),
     )

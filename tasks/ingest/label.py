@@ -14,8 +14,12 @@ from catalog.store import Store, open_store
 from lidarpainter_models.lidar.movers import FoundActor, box_of, find_movers, unboxed
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.frame_content import FrameContent
-from lidarpainter_models.scenes.records import BoxRecord
-from lidarpainter_models.scenes.rewriting import FURTHER_ENTRIES, header_of, write_anew
+from lidarpainter_models.scenes.rewriting import (
+    FURTHER_ENTRIES,
+    header_of,
+    track_boxes,
+    write_anew,
+)
 from lidarpainter_models.scenes.schema import LABELLED
 from lidarpainter_models.scenes.tracks import ActorTrack
 from tasks.ingest.ingest import STAGE as WRITE
@@ -86,13 +90,13 @@ def ingest_labelled(
     name = sequence or scene.sequence + SUFFIX
     require_free(store, scene, name, STAGE)
     actors = _named(unboxed(load_actors(store, found), scene.tracks), scene.tracks)
-    boxes = _by_frame(actors)
+    tracks = [actor.track for actor in actors]
     entries = {key: scene.manifest[key] for key in FURTHER_ENTRIES if key in scene.manifest}
     scores = {actor.track.actor_id: actor.score for actor in actors}
     header = header_of(scene, {**entries, LABELLED: {**entries.get(LABELLED, {}), **scores}})
 
     def completed(frame: FrameContent) -> FrameContent:
-        return replace(frame, boxes=[*frame.boxes, *boxes.get(frame.frame_index, [])])
+        return replace(frame, boxes=[*frame.boxes, *track_boxes(tracks, frame.frame_index)])
 
     told = {"from": scene_id, "digest": scene.content_digest, "artefact": found.ref.artefact_id}
     with writing(store, f"{scene.dataset}/{name}"):
@@ -154,24 +158,6 @@ def _named(actors: Sequence[FoundActor], known: Sequence[ActorTrack]) -> list[Fo
         replace(actor, track=replace(actor.track, actor_id=name))
         for actor, name in zip(actors, free, strict=False)
     ]
-
-
-def _by_frame(actors: Sequence[FoundActor]) -> dict[int, list[BoxRecord]]:
-    boxes: dict[int, list[BoxRecord]] = {}
-    for track in (actor.track for actor in actors):
-        length_m, width_m, height_m = track.size_m.tolist()
-        for row, frame_index in enumerate(track.frame_indices.tolist()):
-            record = BoxRecord(
-                actor_id=track.actor_id,
-                category=track.category,
-                timestamp_ns=int(track.timestamps_ns[row]),
-                world_from_box=track.world_from_box[row],
-                size_m=(length_m, width_m, height_m),
-                is_moving=True,
-                num_points=int(track.num_points[row]),
-            )
-            boxes.setdefault(frame_index, []).append(record)
-    return boxes
 
 
 def _row(track: ActorTrack, score: float | None, given: ActorTrack | None) -> dict[str, Any]:

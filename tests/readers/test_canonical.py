@@ -76,6 +76,7 @@ def test_times_in_another_unit_are_told_by_the_speed_that_they_make(foreign, tmp
 
 def test_entries_that_the_format_does_not_know_stay_behind(foreign, tmp_path):
     known = {"global_frame": "map", "generator": {"name": "a street"}, "stress": {"level": 1}}
+    known |= {"poses": "localised", "labelled": {"car-1": 0.7}}
     edit_manifest(foreign, lambda manifest: manifest.update(known, invented=[1]))
     manifest = DrivingScene.open(ingested(foreign, tmp_path / "store")).manifest
     assert {key: manifest.get(key) for key in (*known, "invented")} == {**known, "invented": None}
@@ -130,6 +131,11 @@ def test_a_scene_of_the_first_version_still_opens_and_comes_in(foreign, tmp_path
         (lambda m: m.update(global_from_world=[float("nan")] * 16), "no list of 16 numbers"),
         (lambda m: m.update(licence=None), "licence is no text"),
         (lambda m: m.update(global_frame=["map"]), "global_frame is no text"),
+        (lambda m: m.update(poses=["none"]), "poses says none of none, localised"),
+        (lambda m: m.update(poses="guessed"), "poses says none of none, localised"),
+        (lambda m: m.update(labelled=["car-1"]), "labelled is no object of scores by actor"),
+        (lambda m: m.update(labelled={"car-1": "high"}), "labelled is no object of scores"),
+        (lambda m: m.update(labelled={"../car": 0.5}), "name '../car' cannot be used"),
         (lambda m: m.update(global_frame="pandaset/002"), "name 'pandaset/002' cannot be used"),
         (lambda m: m["files"].update({"../../x": 1}), "leaves the scene"),
         (lambda m: m["files"].update({"/etc/passwd": 1}), "leaves the scene"),
