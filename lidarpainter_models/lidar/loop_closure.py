@@ -53,13 +53,13 @@ def with_loops_closed(path: DrivenPath, frames: Sequence[SweptFrame]) -> DrivenP
         graph.edges.append(edge)
     for first, second, first_from_second in loops:
         back = np.linalg.inv(first_from_second)
-        edge = registration.PoseGraphEdge(first, second, back, LOOP_INFORMATION, True)
+        edge = registration.PoseGraphEdge(first, second, back, LOOP_INFORMATION, False)
         graph.edges.append(edge)
     registration.global_optimization(
         graph,
         registration.GlobalOptimizationLevenbergMarquardt(),
         registration.GlobalOptimizationConvergenceCriteria(),
-        registration.GlobalOptimizationOption(edge_prune_threshold=0.25, reference_node=0),
+        registration.GlobalOptimizationOption(reference_node=0),
     )
     closed = torch.from_numpy(np.stack([np.asarray(node.pose) for node in graph.nodes]))
     return DrivenPath(timestamps_ns=path.timestamps_ns, world_from_body=closed)

@@ -129,11 +129,11 @@ def yard():
 
 
 def lap(*, drift):
-    """A round of 40 by 20 m and a little more, each step stretched and bent by a share."""
-    step_m, poses = 1.0, [torch.eye(4, dtype=torch.float64)]
-    turns = [math.pi / 2 if number % 30 in (20, 29) else 0.0 for number in range(64)]
+    """A round of 20 by 10 m and a little more, each step stretched and bent by a share."""
+    step_m, poses = 2.0, [torch.eye(4, dtype=torch.float64)]
+    turns = [math.pi / 2 if number % 15 in (9, 14) else 0.0 for number in range(33)]
     for turn in turns:
-        tangent = [0, 0, turn + drift * 0.02, step_m * (1 + drift * 0.02), 0, 0]
+        tangent = [0, 0, turn + drift * 0.04, step_m * (1 + drift * 0.02), 0, 0]
         poses.append(poses[-1] @ rigid_from_tangent(torch.tensor(tangent).double()))
     times_ns = 100_000_000 * torch.arange(len(poses))
     return DrivenPath(timestamps_ns=times_ns, world_from_body=torch.stack(poses))
