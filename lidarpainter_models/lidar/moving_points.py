@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
 from lidarpainter_models.checks.seen_space import SeenSpace
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.ground_heights import CELL_M, GroundHeights
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -48,9 +49,20 @@ class Clump:
 
 
 def moving_clumps(scene: DrivingScene) -> dict[int, list[Clump]]:
-    """What moves in each frame that has sweeps; of a frame without others about it nothing."""
+    """What moves in each frame that has sweeps; of a frame without others about it nothing.
+
+    Raises:
+        SceneError: fewer than two frames have sweeps.
+    """
     frames = scene.swept_frames
+    if len(frames) < 2:
+        raise SceneError(
+            f"{scene.path}: {len(frames)} frames with LiDAR sweeps, expected two at least: nothing "
+            "else tells who moves"
+        )
     seen = list(side_by_side(lambda frame: _swept(scene, frame), frames))
+    if not any(len(one.points_m) for one in seen):
+        return {}
     ground = _Ground([one.points_m for one in seen])
     places = range(len(frames))
     clumps = side_by_side(lambda place: _clumps(seen, place, ground), places)

@@ -1,10 +1,13 @@
 """Who moves is found from sweeps alone, with boxes where it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from lidarpainter_models.checks.seen_space import SeenSpace
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.mover_boxes import boxed, smoothed
 from lidarpainter_models.lidar.mover_tracks import tracked
 from lidarpainter_models.lidar.movers import box_of, find_movers, unboxed
@@ -103,6 +106,15 @@ def test_what_stays_has_no_box():
     assert boxed(clumps_of(lambda t: (12 + 8 * t, 3.0), num_frames=3)) is None
 
 
+def test_a_lone_ring_and_what_hangs_in_the_air_are_nobody():
+    clumps = clumps_of(lambda t: (12 + 8 * t, 3.0))
+    flat = [replace(c, points_m=c.points_m * [1, 1, 0.05] + [0, 0, 0.7]) for c in clumps]
+    high = [replace(c, points_m=c.points_m + [0, 0, 2.5]) for c in clumps]
+    assert boxed(clumps) is not None
+    assert boxed(flat) is None
+    assert boxed(high) is None
+
+
 def test_tracks_that_cross_keep_apart():
     first = clumps_of(lambda t: (20 + 8 * t, 2.0), seed=1)
     second = clumps_of(lambda t: (30 - 8 * t, 5.5), np.pi, seed=2)
@@ -123,6 +135,12 @@ def test_who_is_hidden_for_long_is_somebody_else():
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     return DrivingScene.open(write_street(STREET, tmp_path_factory.mktemp("street")))
+
+
+def test_one_sweep_tells_of_nobody(street, monkeypatch):
+    monkeypatch.setattr(street, "sweeps", street.sweeps[:1])
+    with pytest.raises(SceneError, match="1 frames with LiDAR sweeps, expected two at least"):
+        find_movers(street)
 
 
 def test_cars_of_a_street_are_found_and_nothing_else(street):
