@@ -109,7 +109,7 @@ def test_what_stays_has_no_box():
 def test_a_lone_ring_and_what_hangs_in_the_air_are_nobody():
     clumps = clumps_of(lambda t: (12 + 8 * t, 3.0))
     flat = [replace(c, points_m=c.points_m * [1, 1, 0.05] + [0, 0, 0.7]) for c in clumps]
-    high = [replace(c, points_m=c.points_m + [0, 0, 2.5]) for c in clumps]
+    high = [replace(c, ground_m=c.ground_m - 2.5) for c in clumps]
     assert boxed(clumps) is not None
     assert boxed(flat) is None
     assert boxed(high) is None
