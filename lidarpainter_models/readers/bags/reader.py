@@ -227,10 +227,13 @@ class BagLog:
         time_ns, frame = self._plan.time_of(lidar.topic, frame_index), self._plan.frame_of(lidar)
         offset_ns = points.offset_ns
         middle_ns = int(offset_ns.min(initial=0) + offset_ns.max(initial=0)) // 2
+        held_ns = offset_ns  # the time at which a point is where it is said to be
+        if lidar.is_compensated and not self.is_drive:
+            held_ns = np.zeros_like(offset_ns)
         stored = SweepPoints.of(
             self._placed(lidar, frame, points, time_ns),
             intensity=torch.from_numpy(points.intensity),
-            time_offset_ns=torch.from_numpy((offset_ns - middle_ns).astype(np.int32)),
+            time_offset_ns=torch.from_numpy((held_ns - middle_ns).astype(np.int32)),
             ring=torch.from_numpy(points.ring),
         )
         return SourceSweep(
