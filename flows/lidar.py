@@ -21,16 +21,19 @@ from tasks.lidar.render import render_sweeps
 from tasks.opened import open_scene
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, lineage, open_run
-from tasks.specs import RunSpec
 
 
 def learnt_channel(
-    store: Store, finished: FinishedRun, run: RunSpec, lidar_name: str | None
+    store: Store, finished: FinishedRun, lidar_name: str | None = None
 ) -> ArtefactRef:
-    """The LiDAR channel of a run, learnt unless it is there.
+    """The channel of a LiDAR of a run, of the first one unless named, learnt unless it is there.
 
     A run that was changed from another one has that one's: what was recorded is of it.
+
+    Raises:
+        SceneError: the scene has no such LiDAR.
     """
+    run = view_parameters(finished).run_spec(store.address)
     first = lineage(store, finished)[-1]
     return learn_lidar.fn(run, first.final, LidarConfig(), lidar_name).ref
 
@@ -54,7 +57,7 @@ def sweeps_of_run(
 ) -> dict[str, Any]:
     """The same of a run that is open."""
     spec = view_parameters(finished).run_spec(store.address)
-    channel = learnt_channel(store, finished, spec, request.lidar_name)
+    channel = learnt_channel(store, finished, request.lidar_name)
     made = render_sweeps(spec, finished.final, channel, request, out)
     return {
         "run_id": finished.run_id,
@@ -76,7 +79,7 @@ def evaluate_lidar_run(store: Store, run: str, *, lidar_name: str | None = None)
     """
     finished = open_run(store, run)
     spec = view_parameters(finished).run_spec(store.address)
-    channel = learnt_channel(store, finished, spec, lidar_name)
+    channel = learnt_channel(store, finished, lidar_name)
     made = evaluate_lidar.fn(spec, finished.final, channel, lidar_name)
     found = load_scores(store, made.ref)
     record_scores(store, finished.run_id, finished.scene_id, {LIDAR: found})

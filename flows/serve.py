@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from catalog.artefacts import ArtefactRef
 from catalog.store import Store
 from flows.lidar import learnt_channel
-from flows.parameters import view_parameters
 from flows.views import envelope_of, viewed_run
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import WriteError
@@ -132,12 +130,7 @@ def learn_lidars(store: Store, runs: Sequence[str]) -> None:
         SceneError: a scene has no LiDAR.
     """
     for run in runs:
-        _lidar_of(store, open_run(store, run))
-
-
-def _lidar_of(store: Store, run: FinishedRun) -> ArtefactRef:
-    """What the first LiDAR of a run's log sees, learnt unless it is there."""
-    return learnt_channel(store, run, view_parameters(run).run_spec(store.address), None)
+        learnt_channel(store, open_run(store, run))
 
 
 def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
@@ -153,8 +146,10 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
     return load_served(
         viewed,
         envelope_of(store, run),
-        request.how,
-        lidar=_lidar_of(store, run) if request.has_lidar else None,
+        device=request.device,
+        is_painted=request.is_painted,
+        is_measured=request.is_measured,
+        lidar=learnt_channel(store, run) if request.has_lidar else None,
         name=run.run_id,
     )
 

@@ -144,11 +144,11 @@ def _render_lidar(
     as_json: bool,
 ) -> None:
     """Write sweeps in place of images."""
-    from lidarpainter_models.export.formats import SWEEP_ENDINGS
+    from lidarpainter_models.export.formats import SWEEP_FORMATS
     from lidarpainter_models.lidar.sensors import read_sensor
 
-    if file_format not in SWEEP_ENDINGS:
-        raise ConfigError(f"--lidar-format {file_format!r}: expected {', '.join(SWEEP_ENDINGS)}")
+    if file_format not in SWEEP_FORMATS:
+        raise ConfigError(f"--lidar-format {file_format!r}: expected {', '.join(SWEEP_FORMATS)}")
     sensor = None if lidar == "log" else read_sensor(lidar)
     from lidarpainter_models.export.simulated_sweeps import SweepRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory

@@ -14,8 +14,8 @@ FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "simulated",
 """What a format holds: the fitted scene, recorded images with poses, views along a trajectory, a
 page that plays the drive, recorded LiDAR sweeps, simulated ones, or all that a simulator loads."""
 
-SWEEP_ENDINGS = {"pcd": ".pcd", "pcd.bin": ".pcd.bin", "npz": ".npz", "parquet": ".parquet"}
-"""How the file of a simulated sweep ends, by the word for its format."""
+SWEEP_FORMATS = ("pcd", "pcd.bin", "npz", "parquet")
+"""Formats of LiDAR sweeps, by how their files end."""
 
 _WHERE = ("--trajectory", "--camera", "--frames", "--width")
 _WHEN = ("--time", "--actors", "--sky")
@@ -154,14 +154,12 @@ FORMATS: tuple[ExportFormat, ...] = (
         name="lidar",
         kind="sweeps",
         summary="recorded LiDAR sweeps as PCD",
-        writer=f"{_HERE}.lidar_files:write_pcd",
         options=("--frames",),
     ),
     ExportFormat(
         name="lidar-bin",
         kind="sweeps",
         summary="recorded LiDAR sweeps as nuScenes' .pcd.bin",
-        writer=f"{_HERE}.lidar_files:write_pcd_bin",
         options=("--frames",),
     ),
     ExportFormat(

@@ -3,7 +3,8 @@
 Points stand in the frame of their sensor at the time of the sweep, motion already taken out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lidarpainter_models.export.formats import SWEEP_FORMATS
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.records import Sweep, SweepPoints
 from lidarpainter_models.storage.whole_files import write_whole
@@ -23,14 +25,32 @@ _PCD_ROW = np.dtype(
 )
 
 
-def write_pcd(path: Path, sweep: Sweep, points: SweepPoints) -> None:
-    """Write a sweep as binary PCD 0.7, folders included.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WrittenSweep:
+    """A sweep as it is written."""
+
+    sweep: Sweep
+    points: SweepPoints
+    actor_ids: Sequence[str] | None = None
+    """Whom each point has met, empty where it met the street; None where nobody says."""
+
+
+def write_sweep(path: Path, written: WrittenSweep, file_format: str) -> None:
+    """Write a sweep in one of `SWEEP_FORMATS`, folders included.
+
+    PCD is binary, of version 0.7; `pcd.bin` is float32 x, y, z, intensity, ring and nothing else,
+    as nuScenes has it; NPZ and Parquet hold `sweep_columns`.
 
     Raises:
         WriteError: the disk refuses.
     """
+    write_whole(path, _CONTENTS[file_format](written))
+
+
+def _pcd(written: WrittenSweep) -> bytes:
+    points = written.points
     table = np.zeros(points.num_points, dtype=_PCD_ROW)
-    for axis, column in zip("xyz", points_lidar(sweep, points).unbind(1), strict=True):
+    for axis, column in zip("xyz", points_lidar(written.sweep, points).unbind(1), strict=True):
         table[axis] = column.numpy()
     table["intensity"] = points.intensity.numpy()
     table["ring"] = points.ring.numpy()
@@ -49,72 +69,53 @@ def write_pcd(path: Path, sweep: Sweep, points: SweepPoints) -> None:
         f"POINTS {len(table)}",
         "DATA binary",
     )
-    write_whole(path, ("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+    return ("\n".join(header) + "\n").encode("ascii") + table.tobytes()
 
 
-def write_pcd_bin(path: Path, sweep: Sweep, points: SweepPoints) -> None:
-    """Write a sweep as nuScenes does: float32 x, y, z, intensity, ring, and nothing else.
-
-    Raises:
-        WriteError: the disk refuses.
-    """
+def _pcd_bin(written: WrittenSweep) -> bytes:
+    points = written.points
     columns = [points.intensity[:, None], points.ring.float()[:, None]]
-    table = torch.cat([points_lidar(sweep, points), *columns], dim=1)
-    write_whole(path, table.numpy().astype("<f4").tobytes())
+    table = torch.cat([points_lidar(written.sweep, points), *columns], dim=1)
+    return table.numpy().astype("<f4").tobytes()
 
 
-def write_npz(
-    path: Path, sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
-) -> None:
-    """Write a sweep as NumPy arrays: every column of `sweep_columns` under its name.
-
-    Raises:
-        WriteError: the disk refuses.
-    """
+def _npz(written: WrittenSweep) -> bytes:
     content = BytesIO()
-    columns: dict[str, Any] = dict(sweep_columns(sweep, points, actor_ids))
+    columns: dict[str, Any] = dict(sweep_columns(written))
     np.savez_compressed(content, **columns)
-    write_whole(path, content.getvalue())
+    return content.getvalue()
 
 
-def write_parquet(
-    path: Path, sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
-) -> None:
-    """Write a sweep as a Parquet table of `sweep_columns`.
-
-    Raises:
-        WriteError: the disk refuses.
-    """
+def _parquet(written: WrittenSweep) -> bytes:
     import pyarrow as pa
     from pyarrow import parquet
 
     content = BytesIO()
-    parquet.write_table(pa.table(sweep_columns(sweep, points, actor_ids)), content)
-    write_whole(path, content.getvalue())
+    parquet.write_table(pa.table(sweep_columns(written)), content)
+    return content.getvalue()
 
 
-def sweep_columns(
-    sweep: Sweep, points: SweepPoints, actor_ids: Sequence[str] | None = None
-) -> dict[str, np.ndarray]:
+_CONTENTS: dict[str, Callable[[WrittenSweep], bytes]] = dict(
+    zip(SWEEP_FORMATS, (_pcd, _pcd_bin, _npz, _parquet), strict=True)
+)
+
+
+def sweep_columns(written: WrittenSweep) -> dict[str, np.ndarray]:
     """Everything that is known of a sweep's points, column by column.
-
-    Args:
-        sweep: when and where it was taken.
-        points: its points in the world.
-        actor_ids: whom each point has met, empty where it met the street; None where nobody says.
 
     Returns:
         `x`, `y`, `z` (float32, metres, in the frame of the sensor at the time of the sweep),
         `intensity`, `ring`, `return`, `timestamp_ns`, and `actor` where it is known.
     """
+    sweep, points = written.sweep, written.points
     places = points_lidar(sweep, points)
     columns = {name: place.numpy() for name, place in zip("xyz", places.unbind(1), strict=True)}
     columns["intensity"] = points.intensity.numpy().astype(np.float32)
     columns["ring"] = points.ring.numpy().astype(np.int16)
     columns["return"] = points.return_index.numpy().astype(np.int8)
     columns["timestamp_ns"] = sweep.timestamp_ns + points.time_offset_ns.numpy().astype(np.int64)
-    if actor_ids is not None:
-        columns["actor"] = np.array(actor_ids, dtype=str)
+    if written.actor_ids is not None:
+        columns["actor"] = np.array(written.actor_ids, dtype=str)
     return columns
 
 

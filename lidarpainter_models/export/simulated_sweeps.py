@@ -1,22 +1,16 @@
 """Simulated sweeps, from the LiDAR of a log or any other, where it went or where nobody drove."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 
 from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.export.formats import SWEEP_ENDINGS
-from lidarpainter_models.export.lidar_files import (
-    write_npz,
-    write_parquet,
-    write_pcd,
-    write_pcd_bin,
-)
+from lidarpainter_models.export.formats import SWEEP_FORMATS
+from lidarpainter_models.export.lidar_files import WrittenSweep
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.returns.channel import LidarChannel
+from lidarpainter_models.gaussians.returns.channel import LidarChannel, Returns
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.firings import MountedLidar
@@ -37,26 +31,16 @@ class SweepRequest:
     """The log's LiDAR in whose place it is; None is the first."""
     frames: slice | None = None
     file_format: str = "pcd"
-    """One of `SWEEP_ENDINGS`."""
+    """One of `SWEEP_FORMATS`."""
     seed: int | None = 0
     """Draws noise and what is lost; None takes what is likelier."""
 
     def __post_init__(self) -> None:
         """Refuse a format that nobody writes."""
-        if self.file_format not in SWEEP_ENDINGS:
+        if self.file_format not in SWEEP_FORMATS:
             raise ConfigError(
-                f"format {self.file_format!r} of sweeps, expected {', '.join(SWEEP_ENDINGS)}"
+                f"format {self.file_format!r} of sweeps, expected {', '.join(SWEEP_FORMATS)}"
             )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class WrittenSweep:
-    """A sweep as it is written."""
-
-    sweep: Sweep
-    points: SweepPoints
-    actor_ids: tuple[str, ...]
-    """Whom each point has met; empty where it met the street."""
 
 
 def simulated_sweeps(
@@ -112,33 +96,19 @@ def _simulated(
     rays = lidar.rays(sweep.timestamp_ns)
     seed = None if request.seed is None else request.seed + sweep.frame_index
     met = channel.simulated(scene, rays, seed=seed)
-    within = (met.range_m >= lidar.sensor.min_range_m) & (met.range_m <= lidar.sensor.max_range_m)
-    back = (met.is_returned & within).nonzero()[:, 0]
-    xyz_m = rays.origin_m[back] + met.range_m[back, None].double() * rays.direction[back]
+    nearest_m, farthest_m = lidar.sensor.min_range_m, lidar.sensor.max_range_m
+    found = met.returns(lidar.sensor.returns)
+    within = (found.range_m >= nearest_m) & (found.range_m <= farthest_m)
+    found = Returns(*(column[within] for column in found))
     points = SweepPoints.of(
-        xyz_m.float(),
-        intensity=met.intensity[back],
-        time_offset_ns=(rays.time_ns[back] - sweep.timestamp_ns).int(),
-        ring=rays.beam[back].short(),
+        found.xyz_m(rays).float(),
+        intensity=met.intensity[found.ray],
+        time_offset_ns=(rays.time_ns[found.ray] - sweep.timestamp_ns).int(),
+        ring=rays.beam[found.ray].short(),
+        return_index=found.number.to(torch.int8),
     )
-    body = met.body[back].clamp(min=0).tolist()
     return WrittenSweep(
-        sweep=replace(sweep, num_points=len(back)),
+        sweep=replace(sweep, lidar_name=lidar.sensor.name, num_points=points.num_points),
         points=points,
-        actor_ids=tuple(names[row] for row in body),
+        actor_ids=tuple(names[row] for row in found.body.clamp(min=0).tolist()),
     )
-
-
-def write_sweep(path: Path, written: WrittenSweep, file_format: str) -> None:
-    """Write one simulated sweep.
-
-    Raises:
-        WriteError: the disk refuses.
-    """
-    if file_format in ("npz", "parquet"):
-        write = write_npz if file_format == "npz" else write_parquet
-        write(path, written.sweep, written.points, written.actor_ids)
-        return
-    plain: Callable[[Path, Sweep, SweepPoints], None]
-    plain = write_pcd if file_format == "pcd" else write_pcd_bin
-    plain(path, written.sweep, written.points)

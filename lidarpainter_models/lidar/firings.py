@@ -25,7 +25,7 @@ from lidarpainter_models.lidar.sensor_estimates import (
     beams_of,
     estimated_sensor,
     points_seen,
-    upright_turn,
+    sensor_seat,
 )
 from lidarpainter_models.lidar.sensors import LidarSensor, preset_of
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -56,6 +56,12 @@ class SweepRays:
         """Some of the rays."""
         return SweepRays(**{name: column[rows] for name, column in vars(self).items()})
 
+    @classmethod
+    def joined(cls, parts: Sequence["SweepRays"]) -> "SweepRays":
+        """The rays of several parts, one after the other."""
+        columns = ([getattr(part, name) for part in parts] for name in vars(parts[0]))
+        return cls(**dict(zip(vars(parts[0]), map(torch.cat, columns), strict=True)))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MountedLidar:
@@ -65,7 +71,7 @@ class MountedLidar:
     """What the log calls it."""
     sensor: LidarSensor
     lidar_from_sensor: Float[Tensor, "4 4"]
-    """Turn of the sensor in the frame that the log calls its LiDAR's; float64."""
+    """Where the sensor sits in the frame that the log calls its LiDAR's; float64."""
     path: DrivenPath
     """`world_from_lidar` at the times of its sweeps."""
     tells_lost: bool = True
@@ -77,12 +83,10 @@ class MountedLidar:
 
     def rays(self, timestamp_ns: int) -> SweepRays:
         """All rays of a sweep around a time, which nothing has sent back."""
-        directions, after_s, beam = map(torch.from_numpy, self.sensor.sweep())
-        times_ns = timestamp_ns + (after_s * 1e9).round().long()
-        columns_ns = times_ns[:: self.sensor.num_beams]
-        poses = self.world_from_sensor(columns_ns)
-        poses = poses.repeat_interleave(self.sensor.num_beams, dim=0)
-        return unanswered_rays(poses, directions, times_ns, beam)
+        turn_ns = round(self.sensor.turn_s * 1e9)
+        after_ns = (torch.from_numpy(self.sensor.shares - 0.5) * turn_ns).round().long()
+        step_ns = timestamp_ns + after_ns
+        return fired_rays(self.sensor, self.world_from_sensor(step_ns), step_ns)
 
 
 def mounted_lidar(
@@ -112,18 +116,18 @@ def mounted_lidar(
     seen = [
         points_seen(scene, sweep, path, torch.eye(4, dtype=torch.float64)) for sweep in looked_at
     ]
-    turn = upright_turn([one.points_m for one in seen])
-    seen = [replace(one, points_m=one.points_m @ turn) for one in seen]  # by the transpose
-    lidar_from_sensor = torch.eye(4, dtype=torch.float64)
-    lidar_from_sensor[:3, :3] = torch.from_numpy(turn)
+    seat = sensor_seat([one.points_m for one in seen])
+    turn, place_m = seat[:3, :3], seat[:3, 3]
+    seen = [replace(one, points_m=(one.points_m - place_m) @ turn) for one in seen]  # transposed
     sensor, are_apart = preset_of(lidar_name) if knows_sheets else None, True
     if sensor is None:
         beams_deg, are_apart = beam_elevations(seen)
         sensor = estimated_sensor(lidar_name, seen, beams_deg, scene)
+    has_second = any(not one.is_first.all() for one in seen)
     return MountedLidar(
         name=lidar_name,
-        sensor=sensor,
-        lidar_from_sensor=lidar_from_sensor,
+        sensor=replace(sensor, returns=2 if has_second else 1),
+        lidar_from_sensor=torch.from_numpy(seat),
         path=path,
         tells_lost=are_apart,
     )
@@ -159,8 +163,20 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
         torch.from_numpy(missing.time_ns),
         torch.from_numpy(missing.beam),
     )
-    pairs = ((getattr(returned, name), getattr(absent, name)) for name in vars(returned))
-    return SweepRays(**dict(zip(vars(returned), map(torch.cat, pairs), strict=True)))
+    return SweepRays.joined([returned, absent])
+
+
+def fired_rays(
+    sensor: LidarSensor,
+    world_from_sensor: Float[Tensor, "steps 4 4"],
+    step_ns: Int[Tensor, " steps"],
+) -> SweepRays:
+    """All rays of a sweep, step after step, by where the sensor was at each step and when."""
+    step = torch.arange(sensor.steps).repeat_interleave(sensor.num_beams)
+    beam = torch.arange(sensor.num_beams).repeat(sensor.steps)
+    head_deg = sensor.head_azimuth_deg(step.numpy())
+    directions = torch.from_numpy(sensor.directions(beam.numpy(), head_deg))
+    return unanswered_rays(world_from_sensor[step], directions, step_ns[step], beam)
 
 
 def unanswered_rays(

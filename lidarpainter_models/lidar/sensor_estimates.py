@@ -3,9 +3,10 @@
 Frames as in `lidar.sensors`; metres.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -24,6 +25,12 @@ LEANS_RAD = np.radians(2.75)
 """No sensor is taken to lean by more."""
 SHARPNESS_DEG = (0.4, 0.2, 0.1, 0.05, 0.025)
 """Lines of elevations are looked for ever more finely."""
+NEAR_M = 12.0
+"""By points so near it is told where the sensor is: of farther ones a centimetre is nothing."""
+PLACED_M = (0.02, 0.01, 0.005, 0.0025)
+"""How far its place is looked for from the last guess, again and again."""
+SURER = 1.02
+"""A place is another one where lines are so much sharper from there."""
 MOST_TRIED = 40_000
 LINE_DEG, LEAST_SHARE = 0.02, 0.1
 """Elevations are counted in steps of so much; a beam has so much of the points of the median."""
@@ -86,32 +93,59 @@ def points_seen(
     )
 
 
-def upright_turn(seen_m: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "3 3"]:
-    """The turn `lidar_from_sensor` under which elevations fall onto the sharpest lines.
+def sensor_seat(seen_m: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "4 4"]:
+    """The pose `lidar_from_sensor` from which elevations fall onto the sharpest lines.
 
-    Sharpness is the sum of squared counts of elevations; it is climbed from coarse counts, which
-    reach far, to fine ones.
+    Sharpness is the sum of squared counts of elevations. How the sensor leans is climbed from
+    coarse counts, which reach far, to fine ones; then where its beams meet, a few centimetres
+    from where a log has it: a centimetre is 0.15 degrees of a beam that meets the road at 4 m.
     """
-    points_m = np.concatenate(seen_m)
-    points_m = points_m[:: max(1, len(points_m) // MOST_TRIED)]
-    points_m = points_m / np.maximum(np.linalg.norm(points_m, axis=1, keepdims=True), 1e-6)
+    all_m = np.concatenate(seen_m)
+    near_m = all_m[np.linalg.norm(all_m, axis=1) < NEAR_M]
+    far, near = (one[:: max(1, len(one) // MOST_TRIED)] for one in (all_m, near_m))
 
-    def sharpness(lean: np.ndarray, width_deg: float) -> float:
-        up = np.array([lean[0], lean[1], 1.0])
-        elevation = np.degrees(np.arcsin(np.clip(points_m @ (up / np.linalg.norm(up)), -1, 1)))
-        counts = np.bincount(((elevation + 90) / width_deg).astype(int))
-        return float(np.square(counts, dtype=float).sum() / len(elevation))
+    def sharpness(seat: np.ndarray, width_deg: float, points_m: np.ndarray) -> float:
+        away_m = points_m - seat[2:]
+        up = np.array([seat[0], seat[1], 1.0]) / math.hypot(seat[0], seat[1], 1.0)
+        sine = (away_m @ up) / np.maximum(np.linalg.norm(away_m, axis=1), 1e-6)
+        place = (np.degrees(np.arcsin(np.clip(sine, -1, 1))) + 90) / width_deg
+        lower = place.astype(int)  # each counts in two bins, so that none has an edge
+        last = int(lower.max()) + 2
+        counts = np.bincount(lower, 1 - place + lower, last)
+        counts += np.bincount(lower + 1, place - lower, last)
+        return float(np.square(counts).sum() / max(len(place), 1))
 
-    lean, reach = np.zeros(2), LEANS_RAD
+    def climbed(
+        seat: np.ndarray, axes: Sequence[int], steps: np.ndarray, points_m: np.ndarray
+    ) -> np.ndarray:
+        tried = [seat + one for one in _grid(axes, steps)]
+        return max(tried, key=lambda one: sharpness(one, width_deg, points_m))
+
+    seat, reach, finest = np.zeros(5), LEANS_RAD, SHARPNESS_DEG[-1]
     for width_deg in SHARPNESS_DEG:
         steps = np.linspace(-reach, reach, 23 if reach == LEANS_RAD else 9)
-        tried = [lean + np.array([a, b]) for a in steps for b in steps]
-        lean = max(tried, key=lambda one: sharpness(one, width_deg))
+        seat = climbed(seat, (0, 1), steps, far)
         reach = max(2 * (steps[1] - steps[0]), np.radians(width_deg) / 4)
-    level = max((np.zeros(2), lean), key=lambda one: sharpness(one, SHARPNESS_DEG[-1]))
-    turned = rotation_from_vector(torch.tensor([-level[1], level[0], 0.0], dtype=torch.float64))
-    found: Float[np.ndarray, "3 3"] = turned.numpy()
+    seat = max((np.zeros(5), seat), key=lambda one: sharpness(one, finest, far))
+    leant = seat
+    for reach_m in PLACED_M:
+        for axes in ((4,), (2,), (3,)):
+            seat = climbed(seat, axes, np.linspace(-reach_m, reach_m, 9), near)
+        seat = climbed(seat, (0, 1), np.linspace(-reach_m, reach_m, 5) / 10, far)
+    if sharpness(seat, finest, near) < SURER * sharpness(leant, finest, near):
+        seat = leant
+    found = np.eye(4)
+    lean = torch.tensor([-seat[1], seat[0], 0.0], dtype=torch.float64)
+    found[:3, :3], found[:3, 3] = rotation_from_vector(lean).numpy(), seat[2:]
     return found
+
+
+def _grid(axes: Sequence[int], steps: np.ndarray) -> Iterator[Float[np.ndarray, "5"]]:
+    """Changes of a seat (lean ahead and left, place) along some axes, no change first."""
+    for values in sorted(product(steps, repeat=len(axes)), key=lambda one: np.square(one).sum()):
+        change = np.zeros(5)
+        change[list(axes)] = values
+        yield change
 
 
 def beam_elevations(seen: Sequence[SeenPoints]) -> tuple[Float[np.ndarray, " beams"], bool]:
@@ -160,8 +194,9 @@ def _lines(
     elevation_deg: Float[np.ndarray, " points"],
 ) -> tuple[Float[np.ndarray, " beams"], bool]:
     """Elevations that many points share, and whether few points lie between them."""
-    counts = np.bincount(((elevation_deg + 90) / LINE_DEG).astype(int), minlength=8).astype(float)
-    smooth = gaussian_filter1d(counts, 1.5)
+    bins = ((elevation_deg + 90) / LINE_DEG).astype(int)
+    counts = np.bincount(bins, minlength=int(180 / LINE_DEG) + 2)  # none at either end is a line
+    smooth = gaussian_filter1d(counts.astype(float), 1.5)
     is_peak = np.zeros(len(smooth), dtype=bool)
     is_peak[1:-1] = (smooth[1:-1] >= smooth[:-2]) & (smooth[1:-1] > smooth[2:])
     heights = smooth[is_peak & (smooth > smooth.max() / 10)]

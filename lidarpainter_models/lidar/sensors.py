@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lidarpainter_models.errors import ConfigError
 
 MOST_BEAMS, MOST_STEPS = 1024, 65_536
 MOST_FILE_BYTES = 1_000_000
+KINDS = {"name": str, "turns_left": bool, "steps": int, "returns": int}
+"""Fields that are neither numbers with a fraction nor lists of them."""
 MOST_TURN_S, MOST_RANGE_M, MOST_DIVERGENCE_RAD = 10.0, 2000.0, 0.1
 
 
@@ -42,6 +44,8 @@ class LidarSensor:
     max_range_m: float = 200.0
     divergence_rad: float = 0.003
     """Full angle at which a beam widens."""
+    returns: int = 1
+    """How many returns of a ray are reported at most: 1, or 2, the strongest ones."""
 
     def __post_init__(self) -> None:
         """Refuse what no sensor is."""
@@ -66,6 +70,7 @@ class LidarSensor:
             ("min_range_m", self.min_range_m, 0, self.max_range_m),
             ("max_range_m", self.max_range_m, self.min_range_m, MOST_RANGE_M),
             ("divergence_rad", self.divergence_rad, 0, MOST_DIVERGENCE_RAD),
+            ("returns", self.returns, 1, 2),
         )
         for what, value, least, most in limits:
             if not (math.isfinite(value) and least <= value <= most):
@@ -110,20 +115,10 @@ class LidarSensor:
             [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1
         )
 
-    def sweep(
-        self,
-    ) -> tuple[Float[np.ndarray, "rays 3"], Float[np.ndarray, " rays"], Int[np.ndarray, " rays"]]:
-        """All rays of a sweep, step after step.
-
-        Returns:
-            Directions in the sensor frame (float64), seconds after the middle of the sweep
-            (float64), and the beam of each ray (int64).
-        """
-        step = np.repeat(np.arange(self.steps), self.num_beams)
-        beam = np.tile(np.arange(self.num_beams), self.steps)
-        after_s = ((step + 0.5) / self.steps - 0.5) * self.turn_s
-        directions = self.directions(beam, self.head_azimuth_deg(step))
-        return directions, after_s, beam
+    @property
+    def shares(self) -> Float[np.ndarray, " steps"]:
+        """How much of the sweep has passed when each step is fired."""
+        return (np.arange(self.steps) + 0.5) / self.steps
 
     def to_record(self) -> dict[str, Any]:
         """What a sensor file holds."""
@@ -152,17 +147,14 @@ def sensor_from_record(record: object, where: str) -> LidarSensor:
 
 def _checked(name: str, value: object, where: str) -> object:
     """A field of a sensor file as the sensor takes it."""
-    if name == "name" and isinstance(value, str) and 0 < len(value) <= 80:
-        return value
-    if name == "turns_left" and isinstance(value, bool):
-        return value
-    if name == "steps" and isinstance(value, int) and not isinstance(value, bool):
-        return value
     lists = {"elevation_deg": MOST_BEAMS, "azimuth_offset_deg": MOST_BEAMS, "azimuths_deg": 2}
-    if name in lists and isinstance(value, list) and len(value) <= lists[name]:
+    if name in KINDS:
+        if type(value) is KINDS[name] and (name != "name" or 0 < len(str(value)) <= 80):
+            return value
+    elif name in lists and isinstance(value, list) and len(value) <= lists[name]:
         if all(_is_number(one) for one in value) and (name != "azimuths_deg" or len(value) == 2):
             return tuple(float(one) for one in value)
-    elif _is_number(value) and name not in lists and name not in ("name", "steps", "turns_left"):
+    elif _is_number(value) and name not in lists:
         return float(str(value))
     raise ConfigError(f"{where}: {name} cannot be {str(value)[:40]!r} of a sensor")
 

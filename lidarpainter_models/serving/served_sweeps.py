@@ -16,7 +16,7 @@ from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     transform_points,
 )
-from lidarpainter_models.lidar.firings import SweepRays, unanswered_rays
+from lidarpainter_models.lidar.firings import SweepRays, fired_rays
 from lidarpainter_models.lidar.sensors import PRESETS, LidarSensor
 from lidarpainter_models.serving.messages import TimedRequest, read_timed
 from lidarpainter_models.serving.placed_actors import placed_actors
@@ -46,15 +46,10 @@ class SweepRequest(TimedRequest):
 
     def rays(self) -> SweepRays:
         """The rays of one turn, evenly over the span."""
-        directions, after_s, beam = map(torch.from_numpy, self.sensor.sweep())
-        share = after_s / self.sensor.turn_s + 0.5
-        span_ns = (self.end_us - self.start_us) * 1000
-        times_ns = self.start_us * 1000 + (share * span_ns).round().long()
-        columns = share[:: self.sensor.num_beams]
-        start, end = (one.expand(len(columns), 4, 4) for one in self.world_from_sensor)
-        poses = interpolate_rigid(start, end, columns)
-        poses = poses.repeat_interleave(self.sensor.num_beams, dim=0)
-        return unanswered_rays(poses, directions, times_ns, beam)
+        share, span_ns = torch.from_numpy(self.sensor.shares), (self.end_us - self.start_us) * 1000
+        start, end = (one.expand(len(share), 4, 4) for one in self.world_from_sensor)
+        step_ns = self.start_us * 1000 + (share * span_ns).round().long()
+        return fired_rays(self.sensor, interpolate_rigid(start, end, share), step_ns)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,9 +8,7 @@ import torch
 
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.stress.frames import Frame, Turn
-
-CLUTTER_M = 12.0
-"""Rain and spray return from up to this distance."""
+from lidarpainter_models.weather.water import DROPS_RETURN_M
 
 
 def beams(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
@@ -39,7 +37,7 @@ def clutter(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
     def rained(turn: Turn) -> Turn:
         own = _own_points(turn)
         away_m = own.norm(dim=1).clamp_min(1e-3)
-        nearest_m = torch.minimum(away_m, torch.full_like(away_m, CLUTTER_M))
+        nearest_m = torch.minimum(away_m, torch.full_like(away_m, DROPS_RETURN_M))
         stop_m = nearest_m * _drawn(turn, dice)
         is_drop = _drawn(turn, dice) < level
         share = torch.where(is_drop, stop_m / away_m, torch.ones_like(away_m))

@@ -24,11 +24,11 @@ WETNESS = 0.8
 """How far surfaces darken like wet ones; the road wholly, walls half as much."""
 RAIN_MM_PER_H = 25.0
 """Heavy rain."""
+DROPS_RETURN_M = 12.0
+"""Rain and spray send a LiDAR's light back from up to this distance."""
 
 
-def wet_reflectance(
-    reflectance: Float[Tensor, "*grid 3"], wetness: float
-) -> Float[Tensor, "*grid 3"]:
+def wet_reflectance(reflectance: Float[Tensor, "*grid"], wetness: float) -> Float[Tensor, "*grid"]:
     """Dry reflectance r turned to r^1.5 as far as it is wet."""
     return reflectance + wetness * (reflectance.clamp_min(0) ** WET_POWER - reflectance)
 

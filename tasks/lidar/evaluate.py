@@ -1,6 +1,7 @@
 """Judge simulated sweeps of a run by those that no fit has read."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -51,7 +52,8 @@ _Judged = tuple[LidarEvaluation, LidarChannel, GaussianScene]
 
 
 def _judged(this: OpenedRun, fitted: FittedRef, channel: ArtefactRef, name: str) -> _Judged:
-    scene = load_scene(this.store, fitted.gaussians)
+    # what was recorded is of clear air, whatever style the run is in
+    scene = replace(load_scene(this.store, fitted.gaussians), style=None)
     evaluation = LidarEvaluation(
         scene=corrected_scene(this, scene),
         lidar=mounted(this, scene, name),

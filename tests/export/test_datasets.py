@@ -18,7 +18,7 @@ from lidarpainter_models.export.datasets import (
     write_colmap,
     write_nerfstudio,
 )
-from lidarpainter_models.export.lidar_files import points_lidar, write_pcd, write_pcd_bin
+from lidarpainter_models.export.lidar_files import WrittenSweep, points_lidar, write_sweep
 from lidarpainter_models.export.videos import images_per_second, video_file
 from lidarpainter_models.scenes.records import Sweep, SweepPoints
 
@@ -96,7 +96,7 @@ def test_open3d_reads_a_sweep_in_the_frame_of_its_sensor(tmp_path):
     import open3d
 
     sweep, points = one_sweep()
-    write_pcd(tmp_path / "a.pcd", sweep, points)
+    write_sweep(tmp_path / "a.pcd", WrittenSweep(sweep=sweep, points=points), "pcd")
     found = open3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
     local = torch.from_numpy(found.point.positions.numpy())
     back = local.double() @ sweep.world_from_lidar[:3, :3].T + sweep.world_from_lidar[:3, 3]
@@ -108,7 +108,7 @@ def test_open3d_reads_a_sweep_in_the_frame_of_its_sensor(tmp_path):
 
 def test_the_form_of_nuscenes_is_five_floats_a_point(tmp_path):
     sweep, points = one_sweep()
-    write_pcd_bin(tmp_path / "a.pcd.bin", sweep, points)
+    write_sweep(tmp_path / "a.pcd.bin", WrittenSweep(sweep=sweep, points=points), "pcd.bin")
     table = np.fromfile(tmp_path / "a.pcd.bin", dtype=np.float32).reshape(-1, 5)
     np.testing.assert_array_equal(table[:, :3], points_lidar(sweep, points).numpy())
     np.testing.assert_array_equal(table[:, 4], [3, 2, 1])

@@ -15,7 +15,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "exports.md"
 def test_a_format_is_found_and_loads_its_writer(row):
     assert export_format(row.name) is row
     assert (row.writer == "") == (
-        row.kind in ("views", "page", "simulated")
+        row.kind in ("views", "page", "sweeps", "simulated")
     )  # written view by view
     assert not row.writer or callable(row.load_writer())
     reader = row.load_reader()

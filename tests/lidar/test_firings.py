@@ -68,6 +68,15 @@ def test_a_lean_that_the_log_keeps_to_itself_is_found(scene):
     assert torch.allclose(up, leant.mT[:, 2], atol=np.radians(0.05))
 
 
+def test_a_place_that_the_log_has_wrong_is_found(scene):
+    aside_m = torch.tensor([0.01, 0.0, -0.02]).double()
+    hidden = torch.eye(4, dtype=torch.float64)
+    hidden[:3, 3] = aside_m
+    found = mounted_lidar(replace_poses(scene, hidden), LIDAR.name)
+    # a street has no beam that meets things so near that a millimetre is told
+    assert torch.allclose(found.lidar_from_sensor[:3, 3], -aside_m, atol=0.006)
+
+
 def replace_poses(scene, lidar_from_lidar):
     """The scene, with LiDAR poses that lean against the true ones."""
     told = object.__new__(DrivingScene)

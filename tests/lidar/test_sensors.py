@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.lidar.firings import fired_rays
 from lidarpainter_models.lidar.sensors import (
     PRESETS,
     LidarSensor,
@@ -34,14 +36,13 @@ def test_presets_have_the_beams_of_their_names():
 
 def test_a_turn_begins_behind_and_goes_to_the_right():
     sensor = LidarSensor(name="two", elevation_deg=(0.0, 30.0), steps=4)
-    directions, after_s, beam = sensor.sweep()
-    first, second = directions[0], directions[3]
+    rays = fired_rays(sensor, torch.eye(4).double().expand(4, 4, 4), torch.tensor([3, 5, 7, 9]))
+    first, second = rays.direction[0].tolist(), rays.direction[3].tolist()
     assert first == pytest.approx([-np.sqrt(0.5), np.sqrt(0.5), 0])  # behind, to the left
     assert second == pytest.approx([np.sqrt(0.375), np.sqrt(0.375), 0.5])
-    assert beam.tolist() == [0, 1] * 4
-    assert after_s.tolist() == pytest.approx(
-        [-0.0375] * 2 + [-0.0125] * 2 + [0.0125] * 2 + [0.0375] * 2
-    )
+    assert rays.beam.tolist() == [0, 1] * 4
+    assert rays.time_ns.tolist() == [3, 3, 5, 5, 7, 7, 9, 9]
+    assert sensor.shares.tolist() == [0.125, 0.375, 0.625, 0.875]
 
 
 def test_a_beam_may_look_aside_of_the_head():
@@ -70,6 +71,8 @@ NONSENSE = [
     (GOOD | {"colour": 1}, "'colour' is no field of a sensor"),
     (GOOD | {"steps": 0}, "steps 0, expected 1 to 65536"),
     (GOOD | {"steps": 8.5}, "steps cannot be"),
+    (GOOD | {"returns": 3}, "returns 3, expected 1 to 2"),
+    (GOOD | {"returns": 1.5}, "returns cannot be"),
     (GOOD | {"steps": True}, "steps cannot be"),
     (GOOD | {"elevation_deg": []}, "0 beams"),
     (GOOD | {"elevation_deg": [91]}, "elevation_deg 91"),

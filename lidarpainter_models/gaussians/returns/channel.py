@@ -4,9 +4,9 @@ Surfels stand in the frames of their bodies, as Gaussians do, and know their act
 go where a changed scene's actors go, and leave with those that it lacks.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +17,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import joined_gaussians
 from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
+from lidarpainter_models.gaussians.returns.weather import Air
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
 from lidarpainter_models.lidar.firings import SweepRays
@@ -28,6 +29,8 @@ WINDOW_M = 0.2
 """What is measured is the mean of what stops a ray so near to where half of it has been stopped."""
 LISTED = 16
 """Answers of a ray among which that mean is taken."""
+APART_M, LEAST_SECOND = 0.6, 0.25
+"""A second return lies so far from the first, where this part of the ray has been stopped."""
 NOISE_EDGES_M = (0.0, 10.0, 20.0, 40.0, 80.0)
 """From each of these ranges on noise is measured apart."""
 DROP_INPUTS, STRENGTH_INPUTS, HIDDEN = 6, 4, 16
@@ -73,12 +76,29 @@ class MetSurfaces:
     """Logit of the chance of being lost, likewise."""
 
 
+class Returns(NamedTuple):
+    """What comes back of some rays."""
+
+    ray: Int[Tensor, " returns"]
+    range_m: Float[Tensor, " returns"]
+    body: Int[Tensor, " returns"]
+    number: Int[Tensor, " returns"]
+    """Among those of its ray, the nearest first."""
+
+    def xyz_m(self, rays: SweepRays) -> Float[Tensor, "returns 3"]:
+        """Where they lie; world, float64."""
+        away_m = self.range_m[:, None].double() * rays.direction[self.ray]
+        return rays.origin_m[self.ray] + away_m
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedSweep:
     """What a LiDAR would measure along some rays."""
 
     range_m: Float[Tensor, " rays"]
-    """Distance of the first return; 0 where the rays meet nothing."""
+    """Distance of the strongest return; 0 where the rays meet nothing."""
+    second_m: Float[Tensor, " rays"]
+    """Distance of the next strongest, before or behind it; 0 where there is none."""
     intensity: Float[Tensor, " rays"]
     """In the sensor's own unit."""
     lost: Float[Tensor, " rays"]
@@ -87,7 +107,34 @@ class SimulatedSweep:
     """Whether something does: by that chance, or by a draw."""
     body: Int[Tensor, " rays"]
     """Body of the scene that is met; -1 where none is."""
+    second_body: Int[Tensor, " rays"]
+    """Body that the second return is of."""
     alpha: Float[Tensor, " rays"]
+
+    def returns(self, most: int) -> "Returns":
+        """What comes back, at most one or two returns of a ray."""
+        first = self.is_returned.nonzero()[:, 0]
+        number = torch.zeros_like(first)
+        if most < 2:
+            return Returns(first, self.range_m[first], self.body[first], number)
+        second = (self.is_returned & (self.second_m > 0)).nonzero()[:, 0]
+        is_nearer = (self.second_m > 0) & (self.second_m < self.range_m)
+        return Returns(
+            ray=torch.cat([first, second]),
+            range_m=torch.cat([self.range_m[first], self.second_m[second]]),
+            body=torch.cat([self.body[first], self.second_body[second]]),
+            number=torch.cat([is_nearer[first], ~is_nearer[second]]).long(),
+        )
+
+    def cluttered(self, air_m: Float[Tensor, " rays"]) -> "SimulatedSweep":
+        """The same where the air sends some rays back, from how far (inf: not this one)."""
+        is_air = torch.isfinite(air_m)
+        told = {"range_m": air_m, "second_m": 0.0, "intensity": 0.0, "lost": 0.0}
+        told |= {"is_returned": True, "body": -1, "alpha": 1.0}
+        changes = {
+            name: torch.where(is_air, value, getattr(self, name)) for name, value in told.items()
+        }
+        return replace(self, **changes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,15 +160,10 @@ class LidarChannel:
         Returns:
             Solids with strength and drop as channels, their bodies those of the scene.
         """
-        known = {track.actor_id: row for row, track in enumerate(scene.actors.recorded_tracks, 1)}
-        body_of = torch.tensor([0, *(known.get(name, -1) for name in self.actor_ids)])
-        body = body_of[self.surfels.body_index.long()]
-        kept = (body >= 0).nonzero()[:, 0]
-        surfels = replace(
-            self.surfels.select(kept), body_index=body[kept].to(self.surfels.body_index)
-        )
+        surfels, kept = in_bodies_of(scene, self.surfels, self.actor_ids)
         channels = torch.stack([self.strength, self.drop], dim=1)[kept]
-        unswept = [row for name, row in known.items() if name not in self.actor_ids]
+        tracks = enumerate(scene.actors.recorded_tracks, 1)
+        unswept = [row for row, track in tracks if track.actor_id not in self.actor_ids]
         rows = torch.isin(
             scene.gaussians.body_index.long(), torch.tensor(unswept, dtype=torch.int64)
         )
@@ -154,24 +196,36 @@ class LidarChannel:
             drop=found.channels[:, 1] * share,
         )
         logit, intensity = self.heads(met)
-        range_m = measured_range(found.hits, solids.gaussians.opacity, found.median_m)
+        range_m, second_m, second = measured_ranges(
+            found.hits, solids.gaussians.opacity, found.median_m
+        )
         range_m = torch.where(torch.isfinite(range_m), range_m, found.range_m)
         lost = torch.where(found.alpha > 0, torch.sigmoid(logit), 1.0)
+        air = Air.of(scene.style, int(rays.time_ns.median())) if len(rays) else None
+        clear = intensity
+        if air is not None:
+            intensity, lost = air.dimmed(range_m, clear, lost)
+        random = None if seed is None else torch.Generator().manual_seed(seed)
         is_returned = lost < 0.5
-        if seed is not None:
-            random = torch.Generator().manual_seed(seed)
+        if random is not None:
             is_returned = torch.rand(len(lost), generator=random) >= lost
             band = torch.bucketize(range_m, torch.tensor(NOISE_EDGES_M[1:]))
             range_m = range_m + self.noise_m[band] * torch.randn(len(lost), generator=random)
-        nearest = found.nearest.clamp(min=0)
-        return SimulatedSweep(
+        is_met = found.alpha > 0
+        told = SimulatedSweep(
             range_m=range_m.clamp(min=0),
+            second_m=second_m,
             intensity=self.full_intensity * intensity,
             lost=lost,
-            is_returned=is_returned & (found.alpha > 0),
-            body=torch.where(found.nearest >= 0, bodies[nearest], -1),
+            is_returned=is_returned & is_met,
+            body=torch.where(found.nearest >= 0, bodies[found.nearest.clamp(min=0)], -1),
+            second_body=torch.where(second_m > 0, bodies[second.clamp(min=0)], -1),
             alpha=found.alpha,
         )
+        if air is None:
+            return told
+        surface_m = torch.where(is_met, told.range_m, torch.inf)
+        return told.cluttered(air.clutter_m(surface_m, clear, random))
 
     def to_arrays(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Arrays and JSON-able metadata; `channel_from_arrays` inverts it bitwise."""
@@ -218,17 +272,44 @@ def channel_from_arrays(arrays: Mapping[str, Tensor], metadata: Mapping[str, Any
         raise SceneError(f"a stored LiDAR channel is incomplete: {error}") from error
 
 
-def measured_range(
+def measured_ranges(
     hits: RayHits,
     opacity: Float[Tensor, " gaussians"],
     median_m: Float[Tensor, " rays"],
-) -> Float[Tensor, " rays"]:
-    """The mean of what stops a ray near its median; the median itself where nothing is listed."""
-    beside_m = (hits.range_m - median_m[:, None]).abs()
-    weight = blended_hits(hits, opacity) * (beside_m < WINDOW_M)
-    total = weight.sum(dim=1)
-    mean_m = (weight * hits.range_m).sum(dim=1) / total.clamp(min=1e-6)
-    return torch.where(total > 0, mean_m, median_m)
+) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"], Int[Tensor, " rays"]]:
+    """The ranges that rays return from.
+
+    Returns:
+        The mean of what stops a ray near its median, the median itself where nothing is listed;
+        likewise around the Gaussian that stops most of it elsewhere, 0 where that is too little;
+        and the row of that Gaussian.
+    """
+    weight = blended_hits(hits, opacity)
+
+    def mean_around(place_m: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        near = weight * ((hits.range_m - place_m[:, None]).abs() < WINDOW_M)
+        total = near.sum(dim=1)
+        return (near * hits.range_m).sum(dim=1) / total.clamp(min=1e-6), total
+
+    mean_m, total = mean_around(median_m, weight)
+    first_m = torch.where(total > 0, mean_m, median_m)
+    elsewhere = weight * ((hits.range_m - first_m[:, None]).abs() >= APART_M)
+    most = elsewhere.argmax(dim=1, keepdim=True)
+    second_m, total = mean_around(hits.range_m.gather(1, most)[:, 0], elsewhere)
+    row = hits.row.gather(1, most)[:, 0]
+    return first_m, torch.where(total >= LEAST_SECOND, second_m, 0.0), row
+
+
+def in_bodies_of(
+    scene: GaussianScene, surfels: GaussianSet, actor_ids: Sequence[str]
+) -> tuple[GaussianSet, Int[Tensor, " kept"]]:
+    """The surfels of the street and of those actors that a scene has, in its bodies; their rows."""
+    known = {track.actor_id: row for row, track in enumerate(scene.actors.recorded_tracks, 1)}
+    body_of = torch.tensor([0, *(known.get(name, -1) for name in actor_ids)])
+    body = body_of[surfels.body_index.long()]
+    kept = (body >= 0).nonzero()[:, 0]
+    found = surfels.select(kept)
+    return replace(found, body_index=body[kept].to(found.body_index)), kept
 
 
 def without_colours(gaussians: GaussianSet) -> GaussianSet:

@@ -22,6 +22,7 @@ from lidarpainter_models.gaussians.returns.channel import (
     Heads,
     LidarChannel,
     MetSurfaces,
+    in_bodies_of,
     thin_axes,
 )
 from lidarpainter_models.gaussians.returns.settings import LidarConfig
@@ -41,6 +42,10 @@ RATES = {"opacity": 0.1, "offset": 2e-3, "strength": 0.1, "drop": 0.1, "heads": 
 SLOW_FROM, SLOWER = 0.6, 0.3
 """From this part of the steps on rates are so much lower."""
 FIRST_STRENGTH = -1.5
+CARVED, PASSED_M, PASSES, CLEAR = 2, 0.2, 2.0, -4.0
+"""So often surfels are looked for that rays went through: behind whose plane they ended by so much,
+so many times as often as at it. Those begin with this logit of opacity: who passed in a training
+sweep and has no box would stand in the way of all others."""
 
 
 def fit_lidar(
@@ -67,14 +72,11 @@ def fit_lidar(
     """
     sweeps = _sweeps(scene, lidar, frames, config)
     surfels, actor_ids = surfels_of(scene, frames, most=config.num_surfels)
-    known = {track.actor_id: row for row, track in enumerate(fitted.actors.recorded_tracks, 1)}
-    bodies = torch.tensor([0, *(known.get(name, -1) for name in actor_ids)])
-    in_scene = bodies[surfels.body_index.long()]
-    kept = (in_scene >= 0).nonzero()[:, 0]
-    surfels, placed = surfels.select(kept), in_scene[kept].to(surfels.body_index)
+    placed, kept = in_bodies_of(fitted, surfels, actor_ids)
+    surfels = surfels.select(kept)
     if not len(surfels):
         raise SceneError(f"{scene.path.name}: the sweeps of its training frames met nothing")
-    rays = _joined(sweeps)
+    rays = SweepRays.joined(sweeps)
     full = 255.0 if float(rays.intensity.max()) > 1.0 else 1.0
     target = _Target(
         range_m=rays.range_m.float(),
@@ -84,7 +86,7 @@ def fit_lidar(
     learnt = _Learnt.start(surfels, config.seed)
 
     def met() -> RayHits:
-        return learnt.met(fitted, placed, sweeps, config.hits)
+        return learnt.met(fitted, placed.body_index, sweeps, config.hits)
 
     hits = _learn(learnt, met, target, config, progress)
     return LidarChannel(
@@ -107,6 +109,8 @@ def _learn(
 ) -> RayHits:
     """Take all steps; returns what the rays have met last."""
     random = torch.Generator().manual_seed(config.seed)
+    for _ in range(CARVED):
+        learnt.carve(met(), target)
     optimiser, hits = learnt.optimiser(), met()
     for step in range(config.steps):
         if step > 0 and step == config.steps // 2:
@@ -142,11 +146,6 @@ def _sweeps(
         rays = recorded_rays(scene, sweep, lidar)
         found.append(rays.select(torch.randperm(len(rays), generator=random)[:most]))
     return found
-
-
-def _joined(sweeps: Sequence[SweepRays]) -> SweepRays:
-    names = vars(sweeps[0])
-    return SweepRays(**{name: torch.cat([getattr(one, name) for one in sweeps]) for name in names})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -219,6 +218,19 @@ class _Learnt:
         solids = Solids(gaussians=there, channels=torch.zeros(len(there), 0))
         found = [trace_sweep(fitted, solids, one, most_hits=most_hits).hits for one in sweeps]
         return RayHits(*(torch.cat(column) for column in zip(*found, strict=True)))
+
+    @torch.no_grad()
+    def carve(self, hits: RayHits, target: _Target) -> None:
+        """Let surfels begin clear that more rays went through than ended at."""
+        behind_m = (target.range_m[:, None] - hits.range_m) * hits.cosine
+        is_there = (hits.row >= 0) & target.is_returned[:, None]
+        passed, ended = (
+            torch.zeros(len(self.drop)).index_add_(
+                0, hits.row.clamp(min=0).flatten(), (hits.response * is_so * is_there).flatten()
+            )
+            for is_so in (behind_m > PASSED_M, behind_m.abs() <= PASSED_M)
+        )
+        self.opacity_logit[passed > PASSES * ended] = CLEAR
 
     def blended(
         self, hits: RayHits
