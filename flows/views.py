@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from catalog.store import Store
+from flows.lidar import learnt_channel
 from flows.parameters import view_parameters
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.anchoring import calibration_of
@@ -119,15 +120,20 @@ def view_run(
     run: str,
     request: ViewRequest,
     *,
+    has_lidar: bool = False,
     port: int | None,
     opened_at: Callable[[str], None],
     stopped: threading.Event,
 ) -> None:
-    """Show a run in a browser on this machine until stopped; see `tasks.views.drive.view_live`."""
+    """Show a run in a browser on this machine until stopped; see `tasks.views.drive.view_live`.
+
+    With `has_lidar` it can show what the log's first LiDAR would see.
+    """
     finished = open_run(store, run)
     viewed = viewed_run(store, finished, request)
     scenes = {SHOWN: finished.final} | _other_scenes(store, finished)
-    view_live(viewed, request, scenes, port=port, opened_at=opened_at, stopped=stopped)
+    lidar = learnt_channel(store, finished) if has_lidar else None
+    view_live(viewed, request, scenes, lidar=lidar, port=port, opened_at=opened_at, stopped=stopped)
 
 
 def _other_scenes(store: Store, finished: FinishedRun) -> dict[str, FittedRef]:

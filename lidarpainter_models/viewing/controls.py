@@ -18,7 +18,9 @@ CLICK_HINT = "Click on an actor to see what it is."
 class Controls:
     """Every control, to be read and written."""
 
-    def __init__(self, gui: viser.GuiApi, *, num_moments: int, scenes: Sequence[str]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, *, num_moments: int, scenes: Sequence[str], has_sweeps: bool
+    ) -> None:
         """Put the panel together."""
         nothing = np.full((9, 16, 3), 255, np.uint8)
         time, seat, shown = (gui.add_folder(title) for title in ("Time", "Seat", "Shown"))
@@ -38,6 +40,9 @@ class Controls:
                 gui.add_checkbox(name, initial_value=name == "actors")
                 for name in ("actors", "boxes", "tracks", "cameras", "LiDAR")
             )
+            self.simulated = gui.add_checkbox(
+                "LiDAR as simulated", initial_value=False, visible=has_sweeps
+            )
             self.picked = gui.add_markdown(CLICK_HINT)
         with own:
             self.painted = gui.add_checkbox("painted", initial_value=False)
@@ -48,6 +53,6 @@ class Controls:
         """Call back whenever something changed that decides what is shown."""
         for control in (
             *(self.moment, self.seat, self.left_m, self.up_m, self.scene),
-            *(self.actors, self.boxes, self.tracks, self.cameras, self.lidar),
+            *(self.actors, self.boxes, self.tracks, self.cameras, self.lidar, self.simulated),
         ):
             control.on_update(lambda _event: shown())

@@ -44,6 +44,11 @@ class ShownDrive:
     scenes: Mapping[str, Callable[[], GaussianScene]]
     """Opened when first shown, by the names that people choose from; the first is the path's own
     and shown first."""
+    sweeps: Callable[[GaussianScene, int, Float[Tensor, "3"]], Float[Tensor, "points 3"]] | None = (
+        None
+    )
+    """Points of the world that a LiDAR would meet in a scene in a frame, from so far beside where
+    it was; None where nobody learnt it."""
 
     @property
     def camera_name(self) -> str:

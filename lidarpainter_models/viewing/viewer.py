@@ -65,7 +65,10 @@ class LiveViewer:
         self._seat = drive.path.camera(0)
         server.gui.configure_theme(show_share_button=False, show_logo=False)
         self.controls = Controls(
-            server.gui, num_moments=len(drive.path.views), scenes=list(drive.scenes)
+            server.gui,
+            num_moments=len(drive.path.views),
+            scenes=list(drive.scenes),
+            has_sweeps=drive.sweeps is not None,
         )
         self.controls.on_change(self.show)
         self.controls.straighten.on_click(lambda event: self._straighten(event.client))
@@ -91,7 +94,7 @@ class LiveViewer:
                 self._place_rig(view.frame_index)
             self._lidar.cloud.visible = wanted.lidar.value
             if wanted.lidar.value and self._drive.path.recorded.sweeps_of(view.frame_index):
-                points = self._drive.path.recorded.read_positions(view.frame_index)
+                points = self._sweep(view.frame_index)
                 every = max(-(-len(points) // MOST_POINTS), 1)
                 self._lidar.place(points[::every], self._seat.centre_world)
 
@@ -137,6 +140,14 @@ class LiveViewer:
             spec = f"lateral:{wanted.left_m.value:g}+up:{wanted.up_m.value:g}"
             path = replace(path, trajectory=parse_trajectory(spec))
         return path.camera(self._moment)
+
+    def _sweep(self, frame_index: int) -> Float[Tensor, "points 3"]:
+        """What the LiDAR met, or would meet in the scene that is shown, from beside the path."""
+        path, sweeps = self._drive.path, self._drive.sweeps
+        if sweeps is None or not self.controls.simulated.value:
+            return path.recorded.read_positions(frame_index)
+        aside_m = self._camera_aside().centre_world - path.camera(self._moment).centre_world
+        return sweeps(self._nodes.shown.scene, frame_index, aside_m)
 
     def _place_rig(self, frame_index: int) -> None:
         path, scene = self._drive.path, self._drive.path.builder.scene

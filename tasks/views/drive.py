@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import lidarpainter_models
+from catalog.artefacts import ArtefactRef
 from catalog.store import open_store
 from lidarpainter_models.conditioning.followed_paths import FollowedPath
 from lidarpainter_models.errors import ConfigError
@@ -16,13 +17,17 @@ from lidarpainter_models.geometry.trajectory_specs import Trajectory, parse_traj
 from lidarpainter_models.geometry.trajectory_words import RECORDED
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.evaluation.shown import view_time_painting
-from tasks.opened import opened
+from tasks.lidar.channel import lidar_of, load_channel, mounted
+from tasks.opened import OpenedRun, opened
 from tasks.progress import listener
 from tasks.specs import FittedRef
 from tasks.stored import load_scene
 from tasks.views.render import ViewedRun, followed_paths
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
     from lidarpainter_models.viewing.drive_nodes import ShownDrive
 
 STAGE = "page"
@@ -70,6 +75,7 @@ def view_live(
     request: ViewRequest,
     scenes: Mapping[str, FittedRef],
     *,
+    lidar: ArtefactRef | None = None,
     port: int | None,
     opened_at: Callable[[str], None],
     stopped: threading.Event,
@@ -80,6 +86,7 @@ def view_live(
         viewed: the run whose path is followed, and whose scene painters are shown.
         request: the camera and the frames that are followed.
         scenes: fitted scenes by the names that people choose from; the first is shown first.
+        lidar: what the log's first LiDAR was learnt to see; None shows no simulated sweeps.
         port: where to listen; None takes a free one.
         opened_at: told the address.
         stopped: ends the viewer when it is set.
@@ -95,12 +102,30 @@ def view_live(
         this.store, viewed.fitted, viewed.conditions, this.painter, this.device
     )
     label = f"{this.scene.dataset}/{this.scene.sequence}"
-    with live_viewer(shown_drive(viewed, request, scenes), painting, label=label, port=port) as (
-        viewer,
-        address,
-    ):
+    drive = shown_drive(viewed, request, scenes)
+    if lidar is not None:
+        drive = replace(drive, sweeps=_sweeps(this, viewed.fitted, lidar))
+    with live_viewer(drive, painting, label=label, port=port) as (viewer, address):
         opened_at(address)
         viewer.play(stopped)
+
+
+def _sweeps(
+    this: OpenedRun, fitted: FittedRef, ref: ArtefactRef
+) -> Callable[["GaussianScene", int, "Tensor"], "Tensor"]:
+    """Simulated sweeps of the first LiDAR, as the viewer asks for them."""
+    channel = load_channel(this.store, ref)
+    name = lidar_of(this.scene, None)
+    lidar = mounted(this, load_scene(this.store, fitted.gaussians), name)
+    swept = (sweep for sweep in this.scene.sweeps if sweep.lidar_name == name)
+    times_ns = {sweep.frame_index: sweep.timestamp_ns for sweep in swept}
+
+    def points(scene: "GaussianScene", frame_index: int, aside_m: "Tensor") -> "Tensor":
+        rays = lidar.rays(times_ns[frame_index])
+        rays = replace(rays, origin_m=rays.origin_m + aside_m)
+        return channel.simulated(scene, rays, seed=frame_index).returns(1).xyz_m(rays).float()
+
+    return points
 
 
 def _beside(path: FollowedPath) -> Trajectory:

@@ -183,6 +183,29 @@ def test_boxes_and_clicks_are_those_of_the_scene_that_is_shown(drive):
         assert viewer._track_hit((0.0, 0.0, 0.0), (10.0, -4.0, -0.9)).actor_id == "car"
 
 
+def test_simulated_sweeps_are_of_the_scene_and_seat_that_are_shown(drive):
+    asked = []
+
+    def sweeps(scene, frame_index, aside_m):
+        asked.append((scene, frame_index, aside_m))
+        return torch.ones(7, 3)
+
+    with local_server(port=0) as server:
+        viewer = LiveViewer(server, replace(drive, sweeps=sweeps))
+        cloud = server.scene.get_handle_by_name("/drive/lidar")
+        with chosen(viewer, lidar=True):
+            recorded = len(cloud.points)
+            assert recorded > 7
+            assert not asked
+            with chosen(viewer, simulated=True, seat="aside", left_m=1.5):
+                assert len(cloud.points) == 7
+            assert len(cloud.points) == recorded
+    scene, frame_index, aside_m = asked[-1]
+    assert scene is viewer._nodes.shown.scene
+    assert frame_index == drive.path.views[0].frame_index
+    assert aside_m.norm().item() == pytest.approx(1.5, abs=1e-3)
+
+
 def test_only_the_drives_own_scene_can_be_painted(drive):
     painting = Mock(ViewTimePainting)  # nobody paints
     foggy = styled("foggy", scene=drive.path.builder.scene)
