@@ -10,7 +10,7 @@ from catalog.records import json_of
 from catalog.store import Store
 from catalog.tables import Row
 
-JUDGING = ("evaluate", "envelope", "examine", "report")
+JUDGING = ("evaluate", "envelope", "examine", "lidar", "report")
 """Stages that look at a scene and make nothing of it."""
 UNPAINTED = "unpainted"
 """The variant of numbers that are of the first fit."""

@@ -90,6 +90,8 @@ class ReconstructParameters(ViewParameters):
     """Look for what is wrong about the recording, even if no page is to say it."""
     report: bool = True
     """Write the page about the run."""
+    judge_lidar: bool = False
+    """Also judge simulated sweeps of the first LiDAR by those held out, which is learnt for it."""
     judge_view_time: bool = False
     """Also judge what the final scene shows when it is painted at view time."""
 
@@ -104,9 +106,10 @@ class ReconstructParameters(ViewParameters):
         ]
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
+        swept = ["lidar", "evaluate-lidar"] if self.judge_lidar else []
         first = ["examine"] if self.examines else []
         last = ["report"] if self.report else []
-        after = [*first, *([*judged, "envelope"] if self.judge else []), *last]
+        after = [*first, *([*judged, "envelope", *swept] if self.judge else []), *last]
         return ("prepare", "fit", *rounds, *after)
 
     @property

@@ -14,14 +14,17 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, early_end_recorded, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
+from lidarpainter_models.evaluation.score_tables import LIDAR, Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
+from lidarpainter_models.gaussians.returns.settings import LidarConfig
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope
 from tasks.evaluation.views import evaluate, load_scores
+from tasks.lidar.channel import learn_lidar
+from tasks.lidar.evaluate import evaluate_lidar
 from tasks.opened import opened
 from tasks.progress import working_on
 from tasks.reconstruction.examine import STAGE as EXAMINE
@@ -209,6 +212,10 @@ def _judged(
         scores[variant] = load_scores(store, course.add(stage, found).ref)
     walked = find_envelope(course.run, final, course.parameters.evaluation_config)
     scores["painted"][ENVELOPE] = load_envelope(store, course.add(ENVELOPE, walked).ref)
+    if course.parameters.judge_lidar:
+        learnt = course.add(LIDAR, learn_lidar(course.run, final, LidarConfig()))
+        told = course.add(f"evaluate-{LIDAR}", evaluate_lidar(course.run, final, learnt.ref))
+        scores["painted"] |= load_scores(store, told.ref)
     return scores
 
 

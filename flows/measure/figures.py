@@ -8,7 +8,7 @@ from typing import Literal
 from catalog.points import MetricName, Point
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.fronts import Spread
-from lidarpainter_models.evaluation.score_tables import DEPTH
+from lidarpainter_models.evaluation.score_tables import DEPTH, LIDAR
 
 LANES = ("left-2m", "right-2m", "left-3m", "right-3m")
 """The paper's shifts to the sides."""
@@ -21,6 +21,8 @@ QUALITIES: dict[str, tuple[MetricName, ...]] = {
     "aside_ssim": tuple(("truth", lane, "ssim") for lane in LANES),
     "aside_lpips": tuple(("truth", lane, "lpips") for lane in LANES),
     "aside_depth": tuple(("depth", lane, DEPTH) for lane in LANES),
+    "lidar_within": ((LIDAR, "own", "within_10_cm"),),
+    "lidar_drop": ((LIDAR, "neurad-studio", "ray_drop_accuracy"),),
 }
 """The numbers that each is the mean of; where one is missing it is not known."""
 LABELS = {
@@ -32,6 +34,8 @@ LABELS = {
     "aside_ssim": "SSIM 2 and 3 m aside against truth",
     "aside_lpips": "LPIPS 2 and 3 m aside against truth",
     "aside_depth": "LiDAR met within 5 %, 2 and 3 m aside",
+    "lidar_within": "simulated ranges within 10 cm of held-out sweeps",
+    "lidar_drop": "rays told right to come back or not",
     "cpu_seconds": "CPU time to make the scene, s",
     "seconds": "wall time to make the scene, s",
     "peak_memory_bytes": "peak memory, bytes",

@@ -49,7 +49,8 @@ def metric_values(
         for name, value in _numbers(values):
             protocol = "depth" if name.startswith("depth") else "truth"
             found.append((protocol, trajectory, name, value, _reason(values, name, value)))
-    return [*found, *_trusted(scores.get(ENVELOPE))]
+    swept = _by_part({LIDAR: scores[LIDAR]}) if LIDAR in scores else []
+    return [*found, *_trusted(scores.get(ENVELOPE)), *swept]
 
 
 def _by_part(scores: Mapping[str, Any]) -> list[tuple[str, str, str, float | None, str | None]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from lidarpainter_models.evaluation.score_tables import (
     ENVELOPE,
+    LIDAR,
     SCORE_NOTE,
     TRUSTED,
     score_columns,
@@ -158,6 +159,13 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
         columns = ["camera", *map(_with_unit, heads), "views"]
         title = "Held-out views by camera"
         tables.append(Table(title=title, columns=columns, rows=rows, note=HIGHER_NOTE))
+    if swept := result.get(LIDAR):
+        named = {**swept["neurad-studio"], **swept["own"]}
+        title = f"Simulated sweeps of {swept['lidar']} against {swept['num_sweeps']} held-out ones"
+        figures: list[list[Cell]] = [
+            [name, f"{value:.4g}"] for name, value in named.items() if value is not None
+        ]
+        tables.append(Table(title=title, columns=["figure", "value"], rows=figures))
     if envelope := result.get(ENVELOPE):
         tables.append(_envelope(envelope))
     tables.append(

@@ -2,14 +2,16 @@
 
 import json
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import refuse, succeed
 from pyarrow import parquet
-from tiny_street import SCENE
+from tiny_street import SCENE, reconstructed
 
-from flows import lidar
+from flows import lidar, reconstruct
+from flows.measure.figures import qualities
 from lidarpainter_models.gaussians.returns.settings import LidarConfig
 
 QUICK = partial(
@@ -35,6 +37,21 @@ def test_held_out_sweeps_judge_a_run_and_enter_the_catalog(tiny_run):
     name = "ray_drop_accuracy"
     assert entered["neurad-studio", name] == pytest.approx(figures[name])
     assert "median_error_static_m" in succeed(*words, store=tiny_run.store).out
+
+
+def test_a_run_judges_its_sweeps_at_once_where_that_is_asked_for(tiny_run, monkeypatch):
+    monkeypatch.setattr(reconstruct, "LidarConfig", QUICK)
+    result = reconstructed(tiny_run, "--set", "judge_lidar=true", "--json").json
+    within = result["lidar"]["own"]["within_10_cm"]
+    page = Path(result["report"]).read_text("utf-8")
+    assert "Simulated sweeps of main_pandar64 against 3 held-out ones" in page
+    assert f"<td>{within:.4g}</td>" in page
+    found = {
+        (row["protocol"], row["trajectory"], row["name"]): row["value"]
+        for row in tiny_run.store.tables.rows("metrics")
+        if row["run_id"] == result["run_id"]
+    }
+    assert qualities(found)["lidar_within"] == pytest.approx(within)
 
 
 def test_sweeps_of_another_sensor_are_written_beside_the_path(tiny_run, tmp_path):
