@@ -20,8 +20,8 @@ COLUMNS = {
 }
 
 WORDS = """
-dataset: Form of the dataset: pandaset, nuscenes, waymo, av2 (Argoverse 2), kitti, mcap (a bag of
-  ROS 2 or Foxglove), or canonical (scenes in the form that this store has).
+dataset: Form of the dataset: pandaset, nuscenes, waymo, av2 (Argoverse 2), kitti, ncore (NVIDIA's),
+  mcap (a bag of ROS 2 or Foxglove), or canonical (scenes in the form that this store has).
 root: The folder that holds the sequences, as downloaded; of a bag the file.
 sequences: Names of the sequences to take; all that are found if none is named.
 frames: Frames to take as A:B, B excluded, such as 0:40; all if absent.

@@ -59,6 +59,13 @@ def _kitti() -> Reader:
     return Reader(list_kitti_drives, KittiLog)
 
 
+def _ncore() -> Reader:
+    from lidarpainter_models.readers.ncore.reader import NcoreLog
+    from lidarpainter_models.readers.ncore.sequence import list_ncore_sequences
+
+    return Reader(list_ncore_sequences, NcoreLog)
+
+
 def _mcap() -> Reader:
     from lidarpainter_models.readers.bags.chunks import list_bags
     from lidarpainter_models.readers.bags.reader import BagLog
@@ -78,6 +85,7 @@ _READERS: dict[str, Callable[[], Reader]] = {
     "waymo": _waymo,
     "av2": _av2,
     "kitti": _kitti,
+    "ncore": _ncore,
     "mcap": _mcap,
     CANONICAL: _canonical,
 }

@@ -12,9 +12,10 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("flows", "tasks", "catalog", "lidarpainter_models")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 LAZY = {"open3d", "diffusers", "transformers", "peft", "gsplat", "gsply", "grpc", "pxr", "av"}
+LAZY |= {"ncore", "upath"}
 MAX_LINES = 350
 MAX_FUNCTION_LINES = 60
-WHOLE = ("bags", "dev", "diffusion", "docs", "export", "simulators")
+WHOLE = ("bags", "dev", "diffusion", "docs", "export", "ncore", "simulators")
 """Extras that a checkout has."""
 COMPILED = ("lidarpainter_models/kernels/", "lidarpainter_models/synthetic/raytracing/")
 """A compiled loop may stand in one long function."""

@@ -11,6 +11,7 @@ from waymo_records import tfrecord
 from written_logs import WRITERS
 
 NUM_FAST, NUM_ALL = 8, 10_000
+END_BYTES = 4096
 # Python's own unpickling of texts warns of what a damaged one holds
 pytestmark = pytest.mark.filterwarnings("ignore:invalid escape sequence:DeprecationWarning")
 
@@ -27,12 +28,15 @@ def log(request, written, tmp_path):
 
 
 def damaged(content, name, rng):
-    """A damaged file: its JSON values, what is below a gzip or a checksum, or plain bytes."""
+    """A damaged file: JSON values, what is below a gzip or a checksum, a list, or plain bytes."""
     if name.endswith(".json"):
         return damaged_json(content, rng)
     if name.endswith(".gz") and rng.random() < 0.7:
         inside = damaged_bytes(gzip.decompress(content), rng)
         return Damage(gzip.compress(inside.content, 1), f"unzipped, {inside.description}")
+    if name.endswith(".itar") and rng.random() < 0.7:  # images are most of it, its list is last
+        end = damaged_bytes(content[-END_BYTES:], rng)
+        return Damage(content[:-END_BYTES] + end.content, f"its end, {end.description}")
     if name.endswith(".tfrecord") and rng.random() < 0.7:
         records = records_in(content)
         index = int(rng.integers(len(records)))

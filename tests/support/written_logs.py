@@ -12,6 +12,8 @@ from av2_log import LOG, street_like_av2, write_av2_log
 from bag_log import write_foxglove_bag, write_ros_bag
 from drawn_streets import drawn_street
 from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
+from ncore_log import SEQUENCE as NCORE_SEQUENCE
+from ncore_log import write_ncore_log
 from nuscenes_log import SCENE_NAME, reduced, street_like_nuscenes, write_nuscenes_log
 from small_pandaset import PandasetFolder
 from waymo_components import write_v2
@@ -98,6 +100,15 @@ def _bag(folder: Path, write: Callable[..., object]) -> WrittenLog:
     return WrittenLog("mcap", folder / "bags", "drive")
 
 
+def _ncore(folder: Path, store_type: str, zarr_format: int) -> WrittenLog:
+    scene = street_like_av2(folder / "street")
+    how = {"store_type": store_type, "zarr_format": zarr_format}
+    write_ncore_log(scene, folder / "ncore", **how)
+    for file in (folder / "ncore").glob("*/zarr.json.cbor.zlib"):
+        file.unlink()  # what a folder says of itself in one piece may be absent
+    return WrittenLog("ncore", folder / "ncore", NCORE_SEQUENCE, ("ncore4-",))
+
+
 def _canonical(folder: Path) -> WrittenLog:
     scene = _pandaset(folder).ingest(folder / "store")
     return WrittenLog("canonical", scene.parent, scene.name)
@@ -136,6 +147,8 @@ WRITERS: dict[str, Callable[[Path], WrittenLog]] = {
     "kitti, tracking": _kitti_tracking,
     "mcap, ROS 2": lambda folder: _bag(folder, write_ros_bag),
     "mcap, Foxglove": lambda folder: _bag(folder, write_foxglove_bag),
+    "ncore, archives": lambda folder: _ncore(folder, "itar", 2),
+    "ncore, folders": lambda folder: _ncore(folder, "directory", 3),
     "canonical": _canonical,
 }
 """Writes a log into a folder, by what it is called in tests: the dataset, and its version."""
