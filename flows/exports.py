@@ -12,9 +12,12 @@ from lidarpainter_models.export.formats import ExportFormat, export_format
 from lidarpainter_models.export.simulated_sweeps import SweepRequest
 from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
 from tasks.exports.dataset import export_dataset
-from tasks.exports.scene import SceneRequest, export_images, export_scene, export_video
+from tasks.exports.log import export_log
+from tasks.exports.scene import SceneRequest, export_scene
 from tasks.exports.simulator import export_bundle
 from tasks.exports.sweeps import export_sweeps
+from tasks.exports.views import export_images, export_video
+from tasks.opened import open_scene
 from tasks.runs import FinishedRun, lineage, open_run
 from tasks.views.drive import write_page
 from tasks.views.render import ViewedRun
@@ -32,7 +35,8 @@ def export_run(
     """Write a run in one format, by its name, to a file or a new folder.
 
     The request says where to look from, for images, films and data sets; `scene` what a format that
-    holds the scene takes of it: None takes all, at its beginning.
+    holds the scene takes of it: None takes all, at its beginning. A format of logs takes a scene's
+    name too, with a run or without.
 
     Returns:
         What `export --json` prints.
@@ -40,7 +44,11 @@ def export_run(
     Raises:
         ConfigError: no such format, or what was recorded is asked of a run that was changed.
     """
-    row, finished = export_format(wanted), open_run(store, run)
+    row = export_format(wanted)
+    if row.kind == "log" and run in store.scene_ids():
+        made = export_log(open_scene(store, run), row, request.frames, out)
+        return {"run_id": None, "scene": run, "format": row.name, **made}
+    finished = open_run(store, run)
     if row.holds_recorded and finished.change is not None:
         first = lineage(store, finished)[-1]
         raise ConfigError(
@@ -52,7 +60,10 @@ def export_run(
         raise ConfigError(
             "a browser shows the scene itself: --postpaint and --beside are not for it"
         )
-    made = _export(store, finished, row, request, scene or SceneRequest(), out)
+    if row.kind == "log":
+        made = export_log(open_scene(store, finished.scene_id), row, request.frames, out)
+    else:
+        made = _export(store, finished, row, request, scene or SceneRequest(), out)
     return {"run_id": finished.run_id, "scene": finished.scene_id, "format": row.name, **made}
 
 

@@ -43,6 +43,7 @@ Format = Annotated[
 ]
 
 WORDS = """
+run: The run, as other commands take it; for ncore also a scene that has none.
 out: The file to write, or a new folder.
 time: Moment at which actors stand where they are: seconds since the first image, such as 1.5, or
   frame:N, counted from 0.
@@ -82,6 +83,8 @@ def export(  # noqa: PLR0913 - the options of a command
     Images with poses: lidarpainter export latest --format colmap --out dataset --camera all
 
     A film of the whole rig: lidarpainter export latest --format video --camera all --out rig.mp4
+
+    A log that was only ingested: lidarpainter export pandaset/002 --format ncore --out log
     """
     row, followed = export_format(format_), parse_frames(frames)
     time_s, frame = parse_time(time)
@@ -89,8 +92,10 @@ def export(  # noqa: PLR0913 - the options of a command
     of_scene = (has_time, actors, per_actor, sky, spz_version != SPZ_VERSION)
     of_views = (trajectory != RECORDED, camera, frames, width, paints, fps, beside)
     _refuse_unread(row, (*of_scene, *of_views))
-    run_id = checked_words(run, trajectory, painter)
     from catalog.store import existing_store
+
+    is_scene = row.kind == "log" and run in existing_store().scene_ids()
+    run_id = run if is_scene else checked_words(run, trajectory, painter)
     from flows.cli.progress import shown_progress
     from flows.exports import export_run
     from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest

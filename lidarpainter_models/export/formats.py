@@ -10,9 +10,10 @@ from typing import Any, Literal
 
 from lidarpainter_models.errors import ConfigError
 
-FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "simulated", "bundle"]
+FormatKind = Literal["scene", "dataset", "views", "page", "sweeps", "simulated", "bundle", "log"]
 """What a format holds: the fitted scene, recorded images with poses, views along a trajectory, a
-page that plays the drive, recorded LiDAR sweeps, simulated ones, or all that a simulator loads."""
+page that plays the drive, recorded LiDAR sweeps, simulated ones, all that a simulator loads, or the
+recorded log, for which no run is needed."""
 
 SWEEP_FORMATS = ("pcd", "pcd.bin", "npz", "parquet")
 """Formats of LiDAR sweeps, by how their files end."""
@@ -49,7 +50,7 @@ class ExportFormat:
     @property
     def holds_recorded(self) -> bool:
         """Whether it holds what was recorded, which a changed run no longer shows."""
-        return self.kind in ("dataset", "sweeps")
+        return self.kind in ("dataset", "sweeps", "log")
 
     def load_writer(self) -> Callable[..., Any]:
         """The function that writes it; imports whatever that needs."""
@@ -167,6 +168,13 @@ FORMATS: tuple[ExportFormat, ...] = (
         kind="simulated",
         summary="simulated LiDAR sweeps along a trajectory, as Parquet",
         options=("--trajectory", "--frames"),
+    ),
+    ExportFormat(
+        name="ncore",
+        kind="log",
+        summary="the recorded log as NVIDIA's NCore V4, of a scene without a run too",
+        writer=f"{_HERE}.ncore_files:write_ncore",
+        options=("--frames",),
     ),
     ExportFormat(
         name="simulator",
