@@ -13,10 +13,9 @@ from lidarpainter_models.export.simulated_sweeps import SweepRequest
 from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
 from tasks.exports.dataset import export_dataset
 from tasks.exports.log import export_log
-from tasks.exports.scene import SceneRequest, export_scene
+from tasks.exports.scene import SceneRequest, export_images, export_scene, export_video
 from tasks.exports.simulator import export_bundle
 from tasks.exports.sweeps import export_sweeps
-from tasks.exports.views import export_images, export_video
 from tasks.opened import open_scene
 from tasks.runs import FinishedRun, lineage, open_run
 from tasks.views.drive import write_page

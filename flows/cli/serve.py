@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from lidarpainter_models.devices import check_device
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
+    from catalog.store import Store
     from flows.serve import ServeRequest
 
 WORDS = """
@@ -103,16 +105,23 @@ def serve(  # noqa: PLR0913 - the options of a command
 def start(request: "ServeRequest") -> None:
     """Learn what is to be learnt, then answer until a signal comes."""
     from catalog.store import existing_store
-    from flows.cli.progress import shown_progress
     from flows.interruption import starts_anew
-    from flows.serve import learn_lidars, serve_runs
+    from flows.serve import serve_runs
 
     starts_anew("the server")
     store = existing_store()
     if request.has_lidar:
-        with shown_progress():
-            learn_lidars(store, request.runs)
+        learn(store, request.runs)
     serve_runs(store, request, opened_at=opened_at, stopped=threading.Event())
+
+
+def learn(store: "Store", runs: Sequence[str]) -> None:
+    """Learn what the LiDAR of each run's log sees, where that is not known yet, and say how far."""
+    from flows.cli.progress import shown_progress
+    from flows.serve import learn_lidars
+
+    with shown_progress():
+        learn_lidars(store, runs)
 
 
 def opened_at(address: str, http_address: str | None) -> None:

@@ -21,6 +21,7 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.timed_poses import compensated
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
 from lidarpainter_models.readers.ncore.lenses import lens_of
 from lidarpainter_models.readers.ncore.sequence import (
@@ -35,7 +36,7 @@ from lidarpainter_models.readers.ncore.sequence import (
 )
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
-from lidarpainter_models.readers.source_logs.sweep_frames import compensated, nearest_images
+from lidarpainter_models.readers.source_logs.sweep_frames import nearest_images
 from lidarpainter_models.readers.source_logs.swept_boxes import with_motion
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.image_bytes import as_jpeg
