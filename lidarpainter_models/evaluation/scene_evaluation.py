@@ -8,90 +8,26 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
-from statistics import fmean
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer, ViewEvidence
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene
-from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.evaluation.view_scores import ScoredView, ViewScores, score_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.metrics.depth import DepthScores, pooled_inlier_fraction, score_depth
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
-from lidarpainter_models.observations.views import GuidanceView, SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
-from lidarpainter_models.scenes.splits import evenly_taken
 from lidarpainter_models.synthetic.street import SyntheticStreet
-
-MOST_VIEWS = 10
-"""Views that are asked for: of the five shifts painted by default one there and one halfway."""
-MOST_LOST_DB = 0.1
-"""Sound rounds of two streets and PandaSet 002 gained between -0.01 and 0.27 (docs/measuring.md);
-views painted in false colours lose decibels."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RoundGain:
-    """Likely PSNR before and after a round, means over the views asked for."""
-
-    before_db: float
-    after_db: float
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether the round is better taken back."""
-        return self.after_db < self.before_db - MOST_LOST_DB
-
-
-def round_gain(
-    before: GaussianScene,
-    after: GaussianScene,
-    observations: SceneObservations,
-    guidance: Sequence[GuidanceView],
-) -> RoundGain:
-    """What a scene gained by being fitted on with views, one at least, that were painted of it."""
-    chosen = evenly_taken(guidance, MOST_VIEWS)
-    views = [(view.camera, view.timestamp_ns) for view in chosen[::2]]
-    views += [(_halfway(view, observations.views), view.timestamp_ns) for view in chosen[1::2]]
-
-    def evidence(scene: GaussianScene) -> list[ViewEvidence]:
-        gatherer = EvidenceGatherer(scene, observations.lidar_map, observations.views)
-        return [gatherer.of(*view) for view in views]
-
-    first = evidence(before)
-    second = [
-        replace(late, recorded_db=early.recorded_db)
-        for early, late in zip(first, evidence(after), strict=True)
-    ]
-    return RoundGain(before_db=_likely_db(first), after_db=_likely_db(second))
-
-
-def _likely_db(evidence: Sequence[ViewEvidence]) -> float:
-    return fmean(BUNDLED.of(one).predicted_db for one in evidence)
-
-
-def _halfway(painted: GuidanceView, views: Sequence[TrainingView]) -> Camera:
-    """The painted view's camera, half as far from the nearest one that was there at that time."""
-    pose = painted.camera.world_from_camera
-    present = [view for view in views if view.timestamp_ns == painted.timestamp_ns] or views
-    centres = [view.camera.centre_world.to(pose) for view in present]
-    nearest = min(centres, key=lambda centre: float((centre - pose[:3, 3]).norm()))
-    halfway = pose.clone()
-    halfway[:3, 3] = 0.5 * (pose[:3, 3] + nearest)
-    return painted.camera.at(halfway)
-
 
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
@@ -189,7 +125,11 @@ def score_synthetic(
 
 
 def score_geometry(
-    held_out: HeldOut, fitted: GaussianScene, shifts: Sequence[Shift], *, told: Callable[[], None]
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    shifts: Sequence[Shift],
+    *,
+    told: Callable[[], None],
 ) -> dict[str, float | None]:
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory.
 

@@ -16,7 +16,7 @@ import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
-from lidarpainter_models.evaluation.scene_evaluation import round_gain
+from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import FitProgress, FitResult, fit_gaussians

@@ -10,7 +10,7 @@ from strict_device import NAME, strict_runs
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.novel_guidance import NovelCamera, paint_novel_views
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
-from lidarpainter_models.evaluation.scene_evaluation import round_gain
+from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.evaluation.view_scores import ScoredView, score_views
 from lidarpainter_models.geometry.shifts import Shift

@@ -7,7 +7,7 @@ import torch
 from gaussian_world import FRAME_NS, build_world, camera_at
 
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
-from lidarpainter_models.evaluation.scene_evaluation import _halfway, round_gain
+from lidarpainter_models.evaluation.round_gain import _halfway, round_gain
 from lidarpainter_models.observations.views import GuidanceView
 
 

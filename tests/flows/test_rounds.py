@@ -53,7 +53,7 @@ def test_a_later_round_paints_farther_out(tiny_run):
 
 
 def test_a_round_that_is_taken_back_is_made_again_as_its_control(tiny_run, monkeypatch):
-    monkeypatch.setattr("lidarpainter_models.evaluation.scene_evaluation.MOST_LOST_DB", -100.0)
+    monkeypatch.setattr("lidarpainter_models.evaluation.round_gain.MOST_LOST_DB", -100.0)
     words = (*settings("refine.steps=8"), "--no-evaluate", "--no-report", "--json")
     painted, control = (
         reconstructed(tiny_run, "--painter", painter, *words).json for painter in ("warp", "none")
