@@ -115,7 +115,7 @@ def test_eight_clients_get_what_one_gets_and_the_server_does_not_grow(tiny_run):
         last = resident_bytes(process)
         answered, refused = map(sum, zip(*counts, strict=True))
         print(f"{answered} answered, {refused} refused, {first / 1e6:.0f} to {last / 1e6:.0f} MB")  # noqa: T201
-        assert answered > SECONDS / 2
+        assert answered > CLIENTS
         assert refused > 0
         assert last < MOST_GROWTH * first
         end_in_time(process, address, requests)
