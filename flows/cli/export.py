@@ -83,8 +83,6 @@ def export(  # noqa: PLR0913 - the options of a command
     Images with poses: lidarpainter export latest --format colmap --out dataset --camera all
 
     A film of the whole rig: lidarpainter export latest --format video --camera all --out rig.mp4
-
-    A log that was only ingested: lidarpainter export pandaset/002 --format ncore --out log
     """
     row, followed = export_format(format_), parse_frames(frames)
     time_s, frame = parse_time(time)
@@ -92,10 +90,8 @@ def export(  # noqa: PLR0913 - the options of a command
     of_scene = (has_time, actors, per_actor, sky, spz_version != SPZ_VERSION)
     of_views = (trajectory != RECORDED, camera, frames, width, paints, fps, beside)
     _refuse_unread(row, (*of_scene, *of_views))
+    run_id = _subject(row, run, trajectory, painter)
     from catalog.store import existing_store
-
-    is_scene = row.kind == "log" and run in existing_store().scene_ids()
-    run_id = run if is_scene else checked_words(run, trajectory, painter)
     from flows.cli.progress import shown_progress
     from flows.exports import export_run
     from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
@@ -119,6 +115,14 @@ def export(  # noqa: PLR0913 - the options of a command
         )
     shown = {FIGURES.get(name, name): value for name, value in result.items()}
     print_result(f"{row.name} of {result['scene']}", result if as_json else shown, as_json=as_json)
+
+
+def _subject(row: ExportFormat, run: str, trajectory: str, painter: str | None) -> str:
+    """The id of the run; of a format of logs a scene's name stays one, with a run or without."""
+    from catalog.store import existing_store
+
+    is_scene = row.kind == "log" and run in existing_store().scene_ids()
+    return run if is_scene else checked_words(run, trajectory, painter)
 
 
 def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:

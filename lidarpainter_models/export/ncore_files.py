@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float32, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -216,23 +216,23 @@ class _NcoreFiles:
             "resolution": np.array([camera.width_px, camera.height_px], dtype=np.uint64),
             "shutter_type": self._types.ShutterType[_NAMES[shutter]],
             "external_distortion_parameters": None,
-            "principal_point": np.float32([camera.cx_px, camera.cy_px]),
-            "focal_length": np.float32([camera.fx_px, camera.fy_px]),
+            "principal_point": _float32(camera.cx_px, camera.cy_px),
+            "focal_length": _float32(camera.fx_px, camera.fy_px),
         }
         terms = record.distortion.terms
         if model == "fisheye":
-            fisheye, lens["radial_coeffs"] = self._types.OpenCVFisheyeCameraModelParameters, terms
+            fisheye = self._types.OpenCVFisheyeCameraModelParameters
             names = ("resolution", "focal_length", "principal_point", "radial_coeffs")
-            lens["radial_coeffs"] = np.float32(terms)
+            lens["radial_coeffs"] = _float32(*terms)
             return fisheye(**lens, max_angle=fisheye.compute_max_angle(*(lens[n] for n in names)))
         if model == "mei":
             raise SceneError(f"{where} has a lens of model mei, expected none, brown or fisheye")
         k1, k2, p1, p2, *more = (*terms, *(0.0,) * (8 - len(terms)))
         return self._types.OpenCVPinholeCameraModelParameters(
             **lens,
-            radial_coeffs=np.float32([k1, k2, *more]),
-            tangential_coeffs=np.float32([p1, p2]),
-            thin_prism_coeffs=np.zeros(4, dtype=np.float32),
+            radial_coeffs=_float32(k1, k2, *more),
+            tangential_coeffs=_float32(p1, p2),
+            thin_prism_coeffs=_float32(0, 0, 0, 0),
         )
 
     def _write_lidar(self, name: str) -> None:
@@ -309,6 +309,10 @@ class _NcoreFiles:
     def _tell(self) -> None:
         self._done += 1
         self._advanced(self._done, len(self._views) + len(self._sweeps))
+
+
+def _float32(*values: float) -> Float32[np.ndarray, " values"]:
+    return np.array(values, dtype=np.float32)
 
 
 def _microseconds(times_ns: Any) -> Any:  # noqa: ANN401 - one time or an array of them

@@ -11,7 +11,7 @@ from waymo_records import tfrecord
 from written_logs import WRITERS
 
 NUM_FAST, NUM_ALL = 8, 10_000
-END_BYTES = 4096
+END_BYTES = 1024
 # Python's own unpickling of texts warns of what a damaged one holds
 pytestmark = pytest.mark.filterwarnings("ignore:invalid escape sequence:DeprecationWarning")
 

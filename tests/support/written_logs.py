@@ -104,6 +104,7 @@ def _ncore(folder: Path, store_type: str, zarr_format: int) -> WrittenLog:
     scene = street_like_av2(folder / "street")
     how = {"store_type": store_type, "zarr_format": zarr_format}
     write_ncore_log(scene, folder / "ncore", **how)
+    (folder / "ncore" / f"{NCORE_SEQUENCE}.json").unlink()  # who has the stores needs no list
     for file in (folder / "ncore").glob("*/zarr.json.cbor.zlib"):
         file.unlink()  # what a folder says of itself in one piece may be absent
     return WrittenLog("ncore", folder / "ncore", NCORE_SEQUENCE, ("ncore4-",))

@@ -147,7 +147,10 @@ class NcoreSequence:
 
 def _transforms(poses: Component) -> Iterator[BagTransform]:
     """All poses, each from the frame that stands in the other one."""
-    kinds = (("static_poses", "pose", (4, 4)), ("dynamic_poses", "poses", (None, 4, 4)))
+    kinds: tuple[tuple[str, str, Shape], ...] = (
+        ("static_poses", "pose", (4, 4)),
+        ("dynamic_poses", "poses", (None, 4, 4)),
+    )
     for kind, name, shape in kinds:
         for key, record in poses.attributes(kind).items():
             where = f"{poses.place(kind)}, {key!r:.80}"

@@ -184,11 +184,12 @@ def _layout(
 def _as_second(third: dict[str, Any]) -> dict[str, Any]:
     """What Zarr version 3 says of an array, in the words of version 2."""
     plain, *packed = third["codecs"]
-    kind, bits = re.fullmatch(r"(int|uint|float)(8|16|32|64)|bool", third["data_type"]).groups()
+    match = re.fullmatch(r"(int|uint|float)(8|16|32|64)|bool", third["data_type"])
     is_little = plain.get("configuration", {}).get("endian", "little") == "little"
     keys = third["chunk_key_encoding"]
-    if not is_little or plain["name"] != "bytes" or keys["name"] != "default":
-        raise ValueError(f"codec {plain}, keys {keys}")
+    if not (match and is_little and (plain["name"], keys["name"]) == ("bytes", "default")):
+        raise ValueError(f"{third['data_type']}, codec {plain}, keys {keys}")
+    kind, bits = match.groups()
     return {
         "shape": third["shape"],
         "chunks": third["chunk_grid"]["configuration"]["chunk_shape"],
