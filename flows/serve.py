@@ -146,9 +146,7 @@ def _load(store: Store, run: FinishedRun, request: ServeRequest) -> LoadedScene:
     return load_served(
         viewed,
         envelope_of(store, run),
-        device=request.device,
-        is_painted=request.is_painted,
-        is_measured=request.is_measured,
+        request.how,
         lidar=learnt_channel(store, run) if request.has_lidar else None,
         name=run.run_id,
     )

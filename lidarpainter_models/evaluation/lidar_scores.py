@@ -78,8 +78,8 @@ class LidarEvaluation:
             rays = recorded_rays(self.scene, sweep, self.lidar)
             left_out = torch.tensor(LEFT_OUT.get(self.lidar.sensor.name, ()), dtype=torch.int64)
             rays = rays.select((~torch.isin(rays.beam, left_out)).nonzero()[:, 0])
-            told = channel.simulated(fitted, rays)
-            judged.append(_Judged.of(rays, told, boxes, channel.full_intensity))
+            swept = channel.simulated(fitted, rays)
+            judged.append(_Judged.of(rays, swept, boxes, channel.full_intensity))
             progress(done, len(sweeps))
         told = _by_protocol(judged)
         if not self.lidar.tells_lost:

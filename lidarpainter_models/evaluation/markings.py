@@ -246,10 +246,13 @@ def _in_sight(camera: Camera, road: RoadPoints) -> Bool[Tensor, " points"]:
     """Which points of the road a camera sees from `NEAR_M` to `FAR_M`, hidden by no return."""
     uv, depth_m = camera.project(road.all_m.float())
     inside = camera.contains(uv, depth_m)
-    size = {"height_px": camera.height_px, "width_px": camera.width_px}
     before_m = depth_m[inside].contiguous()
     front = splat_points(
-        uv[inside].floor().to(torch.int32), before_m, radius_px=OCCLUDER_RADIUS_PX, **size
+        uv[inside].floor().to(torch.int32),
+        before_m,
+        height_px=camera.height_px,
+        width_px=camera.width_px,
+        radius_px=OCCLUDER_RADIUS_PX,
     )
     uv, depth_m = camera.project(road.xyz_m.float())
     seen = camera.contains(uv, depth_m) & (depth_m > NEAR_M) & (depth_m < FAR_M)

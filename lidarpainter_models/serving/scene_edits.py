@@ -96,7 +96,8 @@ class SceneEdits:
         with self._lock:
             known = {track.actor_id for track in self._world.tracks}
             ids = () if request is None or not self.has_placeholders else request.actor_ids
-            if strangers := [place for place, name in enumerate(ids) if name not in known]:
+            strangers = [place for place, name in enumerate(ids) if name not in known]
+            if request is not None and strangers:
                 world, middles = self._world, middle_of(request.world_from_actors)
                 times_ns = torch.tensor([request.middle_ns])
                 for place in strangers:

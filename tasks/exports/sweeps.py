@@ -56,7 +56,7 @@ def write_sweeps(
         WriteError: the disk refuses; nothing is left half-written.
     """
     listener().started(stage)
-    rows = []
+    rows: list[dict[str, Any]] = []
     with new_folder(out) as folder:
         for done, written in enumerate(made, start=1):
             sweep = written.sweep

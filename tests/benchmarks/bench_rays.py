@@ -69,9 +69,10 @@ def work_of(rays, street):
     with patch.object(cpu, "_follow") as follow:
         trace_rays(rays, street, backend="cpu")
     (_, tile_of, starts, lists, *_), (*_, azimuth, elevation), _, limits, _ = follow.call_args.args
+    bounds, near_m = limits
     is_stopped = met.alpha >= 1 - 2 * LEFT_OVER
     end_m = torch.where(is_stopped, met.hits.range_m.amax(dim=1), torch.inf).numpy()
-    found = looked_at((tile_of, starts, lists), azimuth, elevation, *limits, end_m)
+    found = looked_at((tile_of, starts, lists), azimuth, elevation, bounds, near_m, end_m)
     return (*found, int((met.hits.row >= 0).sum()))
 
 

@@ -129,7 +129,7 @@ class SimulatedSweep:
     def cluttered(self, air_m: Float[Tensor, " rays"]) -> "SimulatedSweep":
         """The same where the air sends some rays back, from how far (inf: not this one)."""
         is_air = torch.isfinite(air_m)
-        told = {"range_m": air_m, "second_m": 0.0, "intensity": 0.0, "lost": 0.0}
+        told: dict[str, Any] = {"range_m": air_m, "second_m": 0.0, "intensity": 0.0, "lost": 0.0}
         told |= {"is_returned": True, "body": -1, "alpha": 1.0}
         changes = {
             name: torch.where(is_air, value, getattr(self, name)) for name, value in told.items()

@@ -187,7 +187,8 @@ def _as_second(third: dict[str, Any]) -> dict[str, Any]:
     match = re.fullmatch(r"(int|uint|float)(8|16|32|64)|bool", third["data_type"])
     is_little = plain.get("configuration", {}).get("endian", "little") == "little"
     keys = third["chunk_key_encoding"]
-    if not (match and is_little and (plain["name"], keys["name"]) == ("bytes", "default")):
+    is_plain = is_little and (plain["name"], keys["name"]) == ("bytes", "default")
+    if match is None or not is_plain:
         raise ValueError(f"{third['data_type']}, codec {plain}, keys {keys}")
     kind, bits = match.groups()
     return {
