@@ -59,7 +59,10 @@ def export_run(
         raise ConfigError(
             "a browser shows the scene itself: --postpaint and --beside are not for it"
         )
-    made = _export(store, finished, row, request, scene or SceneRequest(), out)
+    if row.kind == "log":
+        made = export_log(open_scene(store, finished.scene_id), row, request.frames, out)
+    else:
+        made = _export(store, finished, row, request, scene or SceneRequest(), out)
     return {"run_id": finished.run_id, "scene": finished.scene_id, "format": row.name, **made}
 
 
@@ -89,9 +92,7 @@ def _export(
             return write_page(viewed, request, out)
         case "bundle":
             return export_bundle(viewed.run, finished, envelope_of(store, finished), row, out)
-        case "log":
-            return export_log(open_scene(store, finished.scene_id), row, request.frames, out)
-        case "views":
+        case _:
             return _export_views(viewed, row, request, out)
 
 

@@ -124,7 +124,8 @@ def grid_of(pinhole: Camera, cell_px: float) -> tuple[Image, Image]:
 def on_grid(image: Image, camera: SensorCamera, rays: Image) -> Image:
     """An image of a lens on the cells of a grid of directions."""
     place = camera.project(torch.from_numpy(rays)).numpy().astype(np.float32) - np.float32(0.5)
-    seen = cv2.remap(image, place, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    across, down = place[..., 0], place[..., 1]
+    seen = cv2.remap(image, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     size = (rays.shape[1] // SAMPLES, rays.shape[0] // SAMPLES)
     return cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
 

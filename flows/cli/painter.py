@@ -263,11 +263,13 @@ def ablate(  # noqa: PLR0913 - the options of a command
     from flows.painter_parameters import shaped
     from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 
+    training = shaped(NanoTrainingConfig(), budget_s=budget, steps=steps)
+    assert isinstance(training, NanoTrainingConfig), "of its own kind"  # noqa: S101
     parameters = AblationParameters(
         train_folders=parse_paths(pairs_train, "--pairs-train"),
         test_folders=parse_paths(pairs_test, "--pairs-test"),
         chosen=parse_names(chosen),
-        training=shaped(NanoTrainingConfig(), budget_s=budget, steps=steps),
+        training=training,
         feature_weights=feature_weights,
     )
     parameters = with_overrides(parameters, settings or [])
