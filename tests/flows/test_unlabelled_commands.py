@@ -55,7 +55,7 @@ def test_poses_are_found_and_then_who_moves(store):
     assert float(off_m) < 0.05
     artefacts = len(store.tables.rows("artefacts"))
     shown = call("localise", STRIPPED, store=store)
-    assert "way_m" in shown.out
+    assert "way m" in shown.out
     assert len(store.tables.rows("artefacts")) == artefacts  # it was there
 
     written = succeed("label", f"{STRIPPED}-localised", "--json", store=store).json
