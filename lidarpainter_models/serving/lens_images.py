@@ -34,6 +34,8 @@ DENSITY = 1.1
 """Pixels of a face per pixel of the lens where the lens is finest, along one axis."""
 MOST_PIXELS = 4.0
 """Pixels of all faces together per pixel of the image; beyond it faces are coarser."""
+MOST_TIMES = 4
+"""A face is drawn up to so many times finer, along one axis, than it is sampled."""
 MARGIN_PX = 4
 """Around what rays meet of a face: resampling looks at neighbours."""
 Rows = tuple[tuple[int, int, int], ...]
@@ -64,10 +66,17 @@ class Face:
     """Which pixels of that part are its own."""
     places: tuple[np.ndarray, np.ndarray]
     """Where in the face the pixels of the part are sampled, as OpenCV counts pixels."""
+    times: int
+    """How many pixels are drawn for one of the pinhole, along one axis: Gaussians are made for the
+    pixels that they were fitted to, in coarser ones thin things are too wide."""
 
     def at(self, world_from_camera: Float[Tensor, "4 4"]) -> Camera:
-        """The face as a camera of the world."""
-        return self.pinhole.at(world_from_camera @ self.camera_from_face)
+        """The face as a camera of the world, as fine as it is drawn."""
+        fine = self.pinhole.resized(
+            width_px=self.times * self.pinhole.width_px,
+            height_px=self.times * self.pinhole.height_px,
+        )
+        return fine.at(world_from_camera @ self.camera_from_face)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,8 +91,14 @@ class LensImage:
     """float32, of unit length."""
 
     @classmethod
-    def of(cls, camera: SensorCamera) -> "LensImage":
-        """Find the rays of a lens and the faces that they meet."""
+    def of(cls, camera: SensorCamera, fitted_px: float = 0.0) -> "LensImage":
+        """Find the rays of a lens and the faces that they meet.
+
+        Args:
+            camera: The lens.
+            fitted_px: Focal length of the images that Gaussians were fitted to; faces are drawn
+                about as fine, or as they are sampled if that is finer.
+        """
         rays, is_seen = camera.pixel_rays()
         seen = rays[is_seen]
         one_face = bool((seen[:, 2] > math.cos(ONE_FACE_RAD)).all())
@@ -99,7 +114,7 @@ class LensImage:
         most = MOST_PIXELS * is_seen.numel()
         wanted = sum(part.area * part.focal_px**2 for part in met)
         coarser = min(1.0, math.sqrt(most / max(wanted, 1.0)))
-        faces = [part.face(coarser * part.focal_px) for part in met]
+        faces = [part.face(coarser * part.focal_px, fitted_px) for part in met]
         return cls(camera=camera, faces=tuple(faces), is_seen=is_seen, rays=rays.float())
 
     def drawn(
@@ -108,9 +123,13 @@ class LensImage:
         """The image, by what a function draws of each face; black where the lens sees nothing."""
         image = np.zeros((*self.is_seen.shape, 3), np.float32)
         for face in self.faces:
-            drawn = draw(face).cpu().numpy()
+            fine = draw(face).cpu().permute(2, 0, 1)[None]
+            drawn = torch.nn.functional.avg_pool2d(fine, face.times)[0].permute(1, 2, 0)
             sampled = cv2.remap(
-                drawn, *face.places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+                np.ascontiguousarray(drawn.numpy()),
+                *face.places,
+                cv2.INTER_CUBIC,
+                borderMode=cv2.BORDER_REPLICATE,
             )
             image[face.rows, face.columns][face.is_own] = sampled[face.is_own]
         return torch.from_numpy(image)
@@ -161,8 +180,8 @@ class _Part:
         met = self.met[self.own]
         return float((met.amax(0) - met.amin(0)).prod())
 
-    def face(self, focal_px: float) -> Face:
-        """The face with pixels so fine."""
+    def face(self, focal_px: float, fitted_px: float) -> Face:
+        """The face with pixels so fine, drawn as fine as what was fitted."""
         met = self.met[self.own] * focal_px
         low = (met.amin(0).floor() - MARGIN_PX).tolist()
         high = (met.amax(0).ceil() + MARGIN_PX).tolist()
@@ -189,6 +208,7 @@ class _Part:
             columns=columns,
             is_own=part.numpy(),
             places=(places[..., 0].contiguous().numpy(), places[..., 1].contiguous().numpy()),
+            times=min(max(round(fitted_px / focal_px), 1), MOST_TIMES),
         )
 
 

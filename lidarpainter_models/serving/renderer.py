@@ -286,11 +286,16 @@ class ServedScene:
         """How the image of a lens is put together; found once."""
         with self._lock:
             if camera not in self._lenses:
-                self._lenses[camera] = LensImage.of(camera)
+                self._lenses[camera] = LensImage.of(camera, self._fitted_px)
                 while len(self._lenses) > 1 and self._num_rays() > MOST_RAYS:
                     self._lenses.popitem(last=False)
             self._lenses.move_to_end(camera)
             return self._lenses[camera]
+
+    @cached_property
+    def _fitted_px(self) -> float:
+        """Focal length of the images that the scene was fitted to: the middle one of all views."""
+        return float(np.median([view.camera.fx_px for view in self.builder.training_views]))
 
     def _num_rays(self) -> int:
         return sum(each.is_seen.numel() for each in self._lenses.values())

@@ -10,7 +10,7 @@ from lidarpainter_models.gaussians.model.rolling_shutter import as_read
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
-from lidarpainter_models.serving.lens_images import LensImage, reading_times
+from lidarpainter_models.serving.lens_images import DENSITY, LensImage, reading_times
 from lidarpainter_models.serving.messages import pose_message, read_request
 from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
 from lidarpainter_models.serving.sensor_cameras import (
@@ -98,6 +98,20 @@ def test_a_lens_that_distorts_nothing_shows_what_a_pinhole_shows(street, view):
     direct = street.scene.render(found, view.timestamp_ns, camera_name=view.camera_name).rgb
     assert len(lens.faces) == 1
     assert psnr(drawn, direct) > 30  # what finer pixels show of a random scene, and resampling
+
+
+def test_a_lens_coarser_than_the_fit_is_drawn_as_fine_and_averaged(street, view):
+    found = street.served.found(view)
+    coarse = read_request(street.request(view)).camera.resized(40, 24)
+    lens = LensImage.of(coarse, fitted_px=found.fx_px)
+    (face,) = lens.faces
+    times = face.at(found.world_from_camera).width_px // face.pinhole.width_px
+    assert times > 1
+    assert face.at(found.world_from_camera).fx_px == pytest.approx(found.fx_px, rel=0.3)
+    ramp = torch.arange(face.pinhole.width_px * times) / times
+    rows = face.pinhole.height_px * times
+    drawn = lens.drawn(lambda _face: ramp[None, :, None].expand(rows, -1, 3))
+    assert float(drawn[12, 30, 0] - drawn[12, 10, 0]) == pytest.approx(20 * DENSITY, rel=0.1)
 
 
 def psnr(first, second):
