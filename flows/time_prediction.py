@@ -22,10 +22,10 @@ WHOLE_VIEWS = 0.33
 """A training view's part of new surface, about: the fit finds out and corrects it."""
 COMPILING_S = {
     "prepare": 14.0,
-    "fit": 100.0,
-    "paint-1": 0.8,
-    "examine": 4.4,
-    "evaluate-unpainted": 43.0,
+    "fit": 165.0,
+    "paint-1": 3.4,
+    "examine": 4.7,
+    "evaluate-unpainted": 3.7,
 }
 """Compiling the kernels of each stage where none is kept, in seconds of the reference machine."""
 LEAST_SHARE = 0.02
@@ -36,23 +36,15 @@ PRIOR_SHARE = 0.03
 """Part of a run that must be over before its own pace counts as much as what was expected."""
 MOST_COMPILED_S = 0.5
 """Compiling in one part of a stage, from which on that part says nothing about the speed."""
-FIRST_SHARE = 0.17
+FIRST_SHARE = 0.2
 """Part of a run after which its end is foretold where no past run tells."""
 
 
-def reference_seconds(
-    parameters: "ReconstructParameters", num_views: float, num_recorded: float | None = None
-) -> dict[str, float]:
+def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> dict[str, float]:
     """Return what every stage of a run takes on one core of the reference machine, in order.
 
     Weights were measured on PandaSet 002 and a synthetic street, 160 and 480 pixels wide, 6 and 14
-    training views; kernels are compiled already.
-
-    Args:
-        parameters: What the run is asked for.
-        num_views: Images that the cameras of the run have recorded.
-        num_recorded: Images that all cameras of the scene have recorded, which `examine` looks at;
-            as many where it is not known.
+    training views; kernels are compiled already. `num_views` are recorded images of its cameras.
     """
     pixels = parameters.observation.width_px**2 * 9 / 16
     train = num_views if parameters.split == "all" else num_views / 2
@@ -67,30 +59,26 @@ def reference_seconds(
     of_round = len(parameters.novel.shifts) / max(parameters.rounds, 1) + 0.5
     painted = ceil(train / parameters.novel.every_nth) * of_round
     kinds = {
-        "prepare": num_views * (0.6 + 1e-6 * pixels),
-        "fit": 2.0 + 0.15 * train + steps("fit") * (0.005 + 2.6e-7 * pixels),
-        "paint": painted * (0.25 + 4e-6 * pixels),
-        "refine": steps("refine") * (0.005 + 2.6e-7 * pixels) * (1.6 if paints else 1.0)
-        + (3.0 if paints else 0.0),
-        "examine": 5.0 + 0.18 * (num_recorded or num_views),
-        "evaluate": test * (0.28 + 8e-7 * pixels + (0.02 + 3.6e-6 * pixels) * has_truth),
-        "envelope": 1.0 + 0.5 * test,
-        "report": 1.5 + 4e-5 * pixels,
+        "prepare": num_views * (0.35 + 1e-6 * pixels),
+        "fit": 2.0 + 0.15 * train + steps("fit") * (0.012 + 6e-7 * pixels),
+        "paint": painted * (0.35 + 1e-5 * pixels),
+        "refine": steps("refine") * (0.012 + 6e-7 * pixels) * (1.6 if paints else 1.0)
+        + (6.0 if paints else 0.0),
+        "examine": 2.0 + 1.2 * num_views,
+        "evaluate": test * (0.5 + 5e-6 * pixels) * (2.0 if has_truth else 1.0),
+        "envelope": 3.5 + 0.3 * test,
+        "report": 3.0,
     }
     return {name: kinds[_kind(name)] for name in parameters.stages}
 
 
 def expected_seconds(
-    parameters: "ReconstructParameters",
-    num_views: float,
-    past: Iterable[Mapping[str, Any]],
-    num_recorded: float | None = None,
+    parameters: "ReconstructParameters", num_views: float, past: Iterable[Mapping[str, Any]]
 ) -> tuple[dict[str, float], bool]:
     """Return what every stage of a run will take here, and whether a past run tells.
 
-    Past runs are rows of the table `runs`, each with the `num_views` of its scene and cameras and
-    perhaps the `num_recorded` of all; the newest complete one with parameters of this version tells
-    of each kind of stage.
+    Past runs are rows of the table `runs`, each with the `num_views` of its scene and cameras; the
+    newest complete one with parameters of this version tells of each kind of stage.
     """
     from pydantic import ValidationError
 
@@ -103,13 +91,13 @@ def expected_seconds(
             were = ReconstructParameters.model_validate_json(row["parameters"] or "{}")
         except ValidationError:
             continue
-        reference = reference_seconds(were, row["num_views"], row.get("num_recorded"))
+        reference = reference_seconds(were, row["num_views"])
         took = json.loads(row["stage_seconds"] or "{}")
         for kind in {_kind(name) for name in reference} - paces.keys():
             stages = [name for name in reference if _kind(name) == kind and name in took]
             if stages:
                 paces[kind] = sum(took[s] for s in stages) / sum(reference[s] for s in stages)
-    expected = reference_seconds(parameters, num_views, num_recorded)
+    expected = reference_seconds(parameters, num_views)
     usual = sum(paces.values()) / len(paces) if paces else 1.0
     told = {name: seconds * paces.get(_kind(name), usual) for name, seconds in expected.items()}
     return told, bool(paces)
@@ -237,8 +225,6 @@ class Clock:
 
     def _trust(self, stage: str) -> float:
         """How much a stage's own speed counts: only parts of the first fit are many and alike."""
-        if stage == "examine":  # its checks take from a blink to half of it
-            return 0.0
         share = self._course[stage][-1][0]
         return min(share / TRUSTED_SHARE, 1.0) if stage == "fit" else share**2
 
@@ -272,8 +258,9 @@ class Clock:
 
 
 def _group(stage: str) -> str:
-    """Stages that tell of one another's pace."""
-    return "fit" if _kind(stage) in ("fit", "refine") else "rest"
+    """Stages that tell of one another's pace; to examine takes as long as a recording is large."""
+    is_fit = _kind(stage) in ("fit", "refine")
+    return "fit" if is_fit else "examine" if stage == "examine" else "rest"
 
 
 def as_clock(seconds: float) -> str:

@@ -35,8 +35,8 @@ def run_reconstruction(
 
     check_inputs(parameters, store.address)  # before a server is started for nothing
     scene = next((r for r in store.rows("scenes") if r["scene_id"] == parameters.scene), None)
-    num_views, num_recorded = _num_views(scene, parameters.train_cameras), _num_views(scene, None)
-    with _running(store, parameters, num_views, num_recorded) as listener, ExitStack() as stack:
+    num_views = _num_views(scene, parameters.train_cameras)
+    with _running(store, parameters, num_views) as listener, ExitStack() as stack:
         if is_watched:
             from lidarpainter_models.viewing.watching import watching
 
@@ -58,23 +58,16 @@ def run_demo(
 
 @contextmanager
 def _running(
-    store: Store,
-    parameters: "ReconstructParameters",
-    num_views: float,
-    num_recorded: float | None = None,
+    store: Store, parameters: "ReconstructParameters", num_views: float
 ) -> Iterator[ProgressListener]:
-    """Start a server, and show the stages of a run with so many views, of so many recorded."""
+    """Start a server, and show the stages of a run whose scene has so many views."""
     store.make()
     scenes = {row["scene_id"]: row for row in store.rows("scenes")}
     past = [
-        {
-            **row,
-            "num_views": _num_views(scenes.get(row["scene_id"]), _cameras(row)),
-            "num_recorded": _num_views(scenes.get(row["scene_id"]), None),
-        }
+        {**row, "num_views": _num_views(scenes.get(row["scene_id"]), _cameras(row))}
         for row in store.rows("runs")
     ]
-    expected, is_told = expected_seconds(parameters, num_views, past, num_recorded)
+    expected, is_told = expected_seconds(parameters, num_views, past)
     say_status(SERVER)
     log = store.root / "logs" / "prefect.log"
     with prefect_server(log), shown_progress(expected, is_told_by_past=is_told) as listener:
