@@ -49,11 +49,12 @@ def write_without_poses(scene: DrivingScene, store: Path, sequence: str) -> Path
     eyes = torch.eye(4, dtype=torch.float64).repeat(len(scene.frame_indices), 1, 1)
     moved = _Moved(scene, DrivenPath(timestamps_ns=scene.frame_timestamps_ns, world_from_body=eyes))
     header = replace(header_of(scene, {POSES: NO_POSES}), global_from_world=eyes[0])
-    return write_anew(
-        *(scene, store, sequence, header),
-        lambda frame: replace(moved.frame(frame), boxes=[]),
-        {"without_poses": f"{scene.dataset}/{scene.sequence}"},
-    )
+
+    def frame(content: FrameContent) -> FrameContent:
+        return replace(moved.frame(content), boxes=[])
+
+    about = {"without_poses": f"{scene.dataset}/{scene.sequence}"}
+    return write_anew(scene, store, sequence, header, frame, about)
 
 
 class _Moved:
