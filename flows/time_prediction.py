@@ -67,6 +67,7 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
         "examine": 2.0 + 1.2 * num_views,
         "evaluate": test * (0.5 + 5e-6 * pixels) * (2.0 if has_truth else 1.0),
         "envelope": 3.5 + 0.3 * test,
+        "lidar": 20.0 + 7.0 * train / max(len(parameters.train_cameras or ()), 1),
         "report": 3.0,
     }
     return {name: kinds[_kind(name)] for name in parameters.stages}

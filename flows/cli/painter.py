@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -36,8 +36,7 @@ budget: The maximum CPU seconds of training; the default of the painter if absen
 steps: Number of optimiser steps of training; the default of the painter if absent.
 base: Train the one-step painter on this model: a folder in diffusers' layout or an id, with a
   preset after a colon. Without it, the small painter.
-start: Weights that the training goes on from: nano, or a .safetensors file; it starts anew if
-  absent.
+start: Weights that training goes on from: nano, or a .safetensors file; it starts anew if absent.
 inputs: Inputs that the small painter sees, of `lidarpainter painter info`, with commas between; all
   if absent.
 prompts: Styles to learn, with commas between: clear, which must be among them, foggy, night and
@@ -263,13 +262,12 @@ def ablate(  # noqa: PLR0913 - the options of a command
     from flows.painter_parameters import shaped
     from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 
-    training = shaped(NanoTrainingConfig(), budget_s=budget, steps=steps)
-    assert isinstance(training, NanoTrainingConfig), "of its own kind"  # noqa: S101
+    nano = cast("NanoTrainingConfig", shaped(NanoTrainingConfig(), budget_s=budget, steps=steps))
     parameters = AblationParameters(
         train_folders=parse_paths(pairs_train, "--pairs-train"),
         test_folders=parse_paths(pairs_test, "--pairs-test"),
         chosen=parse_names(chosen),
-        training=training,
+        training=nano,
         feature_weights=feature_weights,
     )
     parameters = with_overrides(parameters, settings or [])

@@ -30,7 +30,8 @@ NEAR_M = 12.0
 PLACED_M = (0.02, 0.01, 0.005, 0.0025)
 """How far its place is looked for from the last guess, again and again."""
 SURER = 1.02
-"""A place is another one where lines are so much sharper from there."""
+"""A place is another one where the lines of near points are so much sharper from there, and those
+of all points no less sharp."""
 MOST_TRIED = 40_000
 LINE_DEG, LEAST_SHARE = 0.02, 0.1
 """Elevations are counted in steps of so much; a beam has so much of the points of the median."""
@@ -132,7 +133,8 @@ def sensor_seat(seen_m: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray,
         for axes in ((4,), (2,), (3,)):
             seat = climbed(seat, axes, np.linspace(-reach_m, reach_m, 9), near)
         seat = climbed(seat, (0, 1), np.linspace(-reach_m, reach_m, 5) / 10, far)
-    if sharpness(seat, finest, near) < SURER * sharpness(leant, finest, near):
+    is_surer = sharpness(seat, finest, near) > SURER * sharpness(leant, finest, near)
+    if not is_surer or sharpness(seat, finest, far) < sharpness(leant, finest, far):
         seat = leant
     found = np.eye(4)
     lean = torch.tensor([-seat[1], seat[0], 0.0], dtype=torch.float64)
@@ -193,7 +195,10 @@ def estimated_sensor(
 def _lines(
     elevation_deg: Float[np.ndarray, " points"],
 ) -> tuple[Float[np.ndarray, " beams"], bool]:
-    """Elevations that many points share, and whether few points lie between them."""
+    """Elevations that many points share, each the median of its own, and whether few lie between.
+
+    A point is of the nearest line, unless it lies farther from it than half of the least gap.
+    """
     bins = ((elevation_deg + 90) / LINE_DEG).astype(int)
     counts = np.bincount(bins, minlength=int(180 / LINE_DEG) + 2)  # none at either end is a line
     smooth = gaussian_filter1d(counts.astype(float), 1.5)
@@ -204,7 +209,12 @@ def _lines(
     peaks = np.flatnonzero(is_peak & (smooth >= LEAST_SHARE * usual))
     between = [smooth[one:other].min() for one, other in pairwise(peaks)]
     valley = np.median(between) if between else 0.0
-    return (peaks + 0.5) * LINE_DEG - 90, bool(valley <= MOST_BETWEEN * usual)
+    lines_deg = (peaks + 0.5) * LINE_DEG - 90
+    reach_deg = np.diff(lines_deg).min() / 2 if len(lines_deg) > 1 else np.inf
+    ascending = np.sort(elevation_deg)
+    starts, ends = (np.searchsorted(ascending, lines_deg + side * reach_deg) for side in (-1, 1))
+    middles = [np.median(ascending[one:other]) for one, other in zip(starts, ends, strict=True)]
+    return np.array(middles), bool(valley <= MOST_BETWEEN * usual)
 
 
 def _turns_left(seen: SeenPoints) -> bool:
