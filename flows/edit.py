@@ -12,8 +12,8 @@ from flows.derive import STYLE, Change, derive_run
 from flows.parameters import view_parameters
 from flows.views import render_run
 from lidarpainter_models.devices import chosen_device
-from lidarpainter_models.editing.edits import encounters, refuse_walls
-from lidarpainter_models.editing.operations import Drive, Operation, parse_operations
+from lidarpainter_models.editing.apply import encounters, refuse_walls
+from lidarpainter_models.editing.script import Drive, Operation, parse_operations
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.painter.selection import PainterChoice

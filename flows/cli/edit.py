@@ -62,7 +62,7 @@ def edit(
         operations += _read_script(path)
     operations += [_operation(words)] if words else []
     from catalog.store import existing_store
-    from lidarpainter_models.editing.operations import parse_operations
+    from lidarpainter_models.editing.script import parse_operations
 
     known = parse_operations(operations, "edit")
     run_id = named_run(run)
@@ -157,7 +157,7 @@ def _value(field: str, text: str) -> str | float:
 
 def _read_script(path: Path) -> list[Any]:
     """The operations of a file, checked."""
-    from lidarpainter_models.editing.operations import parse_script
+    from lidarpainter_models.editing.script import parse_script
 
     try:
         if path.stat().st_size > MOST_SCRIPT_BYTES:

@@ -34,7 +34,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import may_run_on_host
 from lidarpainter_models.lidar.lidar_images import LidarImage, render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.confidence import (
+from lidarpainter_models.conditioning.pixel_confidence import (
     departure_weight,
     guidance_gate,
     view_support,
@@ -32,7 +32,7 @@ from lidarpainter_models.geometry.trajectories import road_directions, shift_pos
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.map_building import views_showing_more
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.confidence import view_support
+from lidarpainter_models.conditioning.pixel_confidence import view_support
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 
 SKY_DEPTH_M = 1e5
 """Far enough for any parallax to vanish, near enough for float32."""

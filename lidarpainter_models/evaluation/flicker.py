@@ -22,7 +22,7 @@ from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack

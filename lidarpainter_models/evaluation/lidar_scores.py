@@ -23,7 +23,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.returns.channel import LidarChannel, SimulatedSweep
 from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_rays
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Sweep

@@ -18,7 +18,7 @@ from torch import Tensor
 from lidarpainter_models.geometry.box_masks import box_outlines
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.metrics.images import (
     ImageScores,
     pooled_psnr,

@@ -26,8 +26,8 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.lidar.points_in_view import read_in_image, with_margin
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 
 WINDOW_S = 1.0
 """Street points measured this long before or after the image are drawn first; where no

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 

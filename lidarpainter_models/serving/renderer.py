@@ -28,7 +28,7 @@ from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
 from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.side_by_side import both
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene

@@ -10,7 +10,7 @@ from catalog.store import Store
 from lidarpainter_models.assets.asset_files import read_asset
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.editing.motions import LogTimes
-from lidarpainter_models.editing.operations import ActorSource
+from lidarpainter_models.editing.script import ActorSource
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.ply_files import read_ply

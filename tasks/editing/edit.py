@@ -13,10 +13,10 @@ from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.scene_styles import styled_scene
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
-from lidarpainter_models.editing.edits import edited, encounters
+from lidarpainter_models.editing.apply import edited, encounters
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
 from lidarpainter_models.editing.joins import OtherRun
-from lidarpainter_models.editing.operations import (
+from lidarpainter_models.editing.script import (
     ActorSource,
     Insert,
     Join,

@@ -16,7 +16,7 @@ from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuid
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.painter.protocol import Painting
 
 WALL_X_M = 12.0

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.warping import WarpTarget, warped_references
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 
 SECOND_NS = 1_000_000_000
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
-from lidarpainter_models.editing.edits import edited
+from lidarpainter_models.editing.apply import edited
 from lidarpainter_models.editing.filled_scenes import filled
 from lidarpainter_models.editing.motions import LogTimes
-from lidarpainter_models.editing.operations import parse_operations
+from lidarpainter_models.editing.script import parse_operations
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.gaussians.fitting.config import DensificationConfig, FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians

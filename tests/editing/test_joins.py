@@ -15,11 +15,11 @@ from gaussian_world import (
 )
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
-from lidarpainter_models.editing.edits import edited
+from lidarpainter_models.editing.apply import edited
 from lidarpainter_models.editing.filled_scenes import filled
 from lidarpainter_models.editing.joins import OtherRun
 from lidarpainter_models.editing.motions import LogTimes
-from lidarpainter_models.editing.operations import Join, Remove
+from lidarpainter_models.editing.script import Join, Remove
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.placing import carried_gaussians

@@ -25,7 +25,7 @@ from lidarpainter_models.evaluation.score_tables import (
 )
 from lidarpainter_models.evaluation.view_confidence import GOOD_DB, Calibration
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.settings import ObservationConfig
 
 NONE = dict.fromkeys(ViewEvidence.__dataclass_fields__, 0.0)

@@ -20,7 +20,7 @@ from lidarpainter_models.evaluation.view_scores import (
     score_views,
 )
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.observations.settings import ObservationConfig
 

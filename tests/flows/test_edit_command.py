@@ -6,7 +6,7 @@ import pytest
 from commands import call, refuse, seen_image, succeed
 from tiny_street import HEIGHT_PX, WIDTH_PX
 
-from lidarpainter_models.editing.edits import edited
+from lidarpainter_models.editing.apply import edited
 from tasks.runs import open_run
 from tasks.stored import load_observations, load_scene
 

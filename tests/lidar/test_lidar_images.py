@@ -6,7 +6,7 @@ from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar import lidar_images
 from lidarpainter_models.lidar.lidar_images import render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 
 SECOND_NS = 1_000_000_000
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)

@@ -10,7 +10,7 @@ from lidarpainter_models.gaussians.fitting.images import full_image, half_image,
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.observations.preparation import prepare_observations

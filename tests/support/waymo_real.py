@@ -22,7 +22,7 @@ from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.readers.waymo.boxes import FramePoints, box_records
 from lidarpainter_models.readers.waymo.cameras import exposure_s, image_record
 from lidarpainter_models.readers.waymo.log import WaymoFrame, WaymoImage
-from lidarpainter_models.readers.waymo.v1 import WaymoRecordSegment
+from lidarpainter_models.readers.waymo.tfrecord import WaymoRecordSegment
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 

@@ -51,9 +51,9 @@ from lidarpainter_models.readers.waymo.log import (
     WaymoSegment,
     WaymoSweep,
 )
+from lidarpainter_models.readers.waymo.parquet import WaymoParquetSegment
 from lidarpainter_models.readers.waymo.range_images import range_points
-from lidarpainter_models.readers.waymo.v1 import WaymoRecordSegment
-from lidarpainter_models.readers.waymo.v2 import WaymoParquetSegment
+from lidarpainter_models.readers.waymo.tfrecord import WaymoRecordSegment
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import SweepPoints
 from lidarpainter_models.scenes.validation import jpeg_header_size

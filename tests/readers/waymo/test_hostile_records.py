@@ -26,7 +26,11 @@ from waymo_records import matrix, message, tfrecord, whole
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.waymo.range_images import MAX_PIXELS, unpack_matrix
-from lidarpainter_models.readers.waymo.v1 import MAX_RECORD_BYTES, TfrecordFile, masked_checksum
+from lidarpainter_models.readers.waymo.tfrecord import (
+    MAX_RECORD_BYTES,
+    TfrecordFile,
+    masked_checksum,
+)
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 FIRST, SECOND, RANGES, PIXEL_POSES = 2, 3, 2, 4

@@ -1,4 +1,4 @@
-"""Operations, one after the other, on a world."""
+"""Apply the operations of an edit script to a scene, one after the other: move, add, take out."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from lidarpainter_models.editing.motions import (
     with_poses,
     within,
 )
-from lidarpainter_models.editing.operations import (
+from lidarpainter_models.editing.script import (
     ActorSource,
     Crop,
     Drive,

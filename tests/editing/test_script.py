@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from lidarpainter_models.editing.operations import parse_script
+from lidarpainter_models.editing.script import parse_script
 from lidarpainter_models.errors import ConfigError
 
 SCRIPT = [

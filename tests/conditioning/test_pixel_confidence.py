@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.conditioning import confidence as confidences
-from lidarpainter_models.conditioning.confidence import (
+from lidarpainter_models.conditioning import pixel_confidence as confidences
+from lidarpainter_models.conditioning.pixel_confidence import (
     departure_weight,
     geometric_confidence,
     guidance_gate,

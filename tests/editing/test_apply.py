@@ -14,10 +14,10 @@ from lidarpainter_models.editing.actor_models import (
     contact_shadow,
     exposure_gain,
 )
-from lidarpainter_models.editing.edits import edited, encounters, refuse_walls
+from lidarpainter_models.editing.apply import edited, encounters, refuse_walls
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
 from lidarpainter_models.editing.motions import AFTER_NS, LogTimes
-from lidarpainter_models.editing.operations import ActorSource, parse_operations
+from lidarpainter_models.editing.script import ActorSource, parse_operations
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.model.blinking import Blinking
