@@ -16,7 +16,7 @@ from pathlib import Path
 
 import lidarpainter_models as lp
 from lidarpainter_models.gaussians.fitting.config import EffortConfig
-from lidarpainter_models.lidar.recording_faults import find_faults
+from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.observations.own_body import own_bodies
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views

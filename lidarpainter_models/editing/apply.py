@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from lidarpainter_models.editing.actor_models import ActorModel
-from lidarpainter_models.editing.joins import OtherRun, joined
 from lidarpainter_models.editing.motions import (
     LogTimes,
     beside_ego,
@@ -19,6 +18,7 @@ from lidarpainter_models.editing.motions import (
     with_poses,
     within,
 )
+from lidarpainter_models.editing.scene_merging import OtherRun, joined
 from lidarpainter_models.editing.script import (
     ActorSource,
     Crop,

@@ -21,9 +21,9 @@ from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.colouring import MapColouring, PointSamples
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, views_showing_more
-from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
+from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.lidar.sweep_registration import register_sweeps
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.image_points import points_from_images

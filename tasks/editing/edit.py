@@ -15,7 +15,7 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.editing.apply import edited, encounters
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
-from lidarpainter_models.editing.joins import OtherRun
+from lidarpainter_models.editing.scene_merging import OtherRun
 from lidarpainter_models.editing.script import (
     ActorSource,
     Insert,

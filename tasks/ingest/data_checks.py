@@ -19,7 +19,11 @@ from lidarpainter_models.checks.pictures import blank_cameras
 from lidarpainter_models.errors import LidarPainterError, SceneError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.lidar.exposure_differences import exposure_differences
-from lidarpainter_models.lidar.recording_faults import cannot_be_told, find_faults, images_agree
+from lidarpainter_models.lidar.spatiotemporal_calibration import (
+    cannot_be_told,
+    find_faults,
+    images_agree,
+)
 from lidarpainter_models.observations import own_body
 from lidarpainter_models.observations.own_body import in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene

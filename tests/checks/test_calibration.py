@@ -12,7 +12,7 @@ from lidarpainter_models.checks.calibration import CameraTurn, check_calibration
 from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.doctor import check_licence
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.lidar.recording_faults import images_agree
+from lidarpainter_models.lidar.spatiotemporal_calibration import images_agree
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street

@@ -157,7 +157,9 @@ def test_runs_of_places_that_nothing_ties_are_not_joined(own_run, monkeypatch):
 
 
 def test_a_run_that_is_joined_to_itself_stays_as_large_as_it_is(own_run, monkeypatch):
-    monkeypatch.setattr("lidarpainter_models.editing.joins.FINER", 0.5)  # it looked well enough
+    monkeypatch.setattr(
+        "lidarpainter_models.editing.scene_merging.FINER", 0.5
+    )  # it looked well enough
     told = succeed("edit", own_run.run_id, "join", own_run.run_id, "--json", store=own_run.store)
     joined = open_run(own_run.store, told.json["run_id"])
     assert [one["op"] for one in told.json["change"]["parameters"]["operations"]] == ["join"]

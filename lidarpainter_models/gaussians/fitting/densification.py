@@ -49,7 +49,7 @@ class GradientTally:
 
     @property
     def mean(self) -> Float[Tensor, " gaussians"]:
-        """Mean over the looks that took each in (`hidden_gaussians`) where it was in the image."""
+        """Mean over the looks that took each in (`occlusion_culling`) where it was in the image."""
         return self.total / self.visits.clamp(min=1)
 
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors, ungroup_tensors
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
-from lidarpainter_models.gaussians.fitting.hidden_gaussians import HiddenGaussians
 from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.loss import Perceptual
+from lidarpainter_models.gaussians.fitting.occlusion_culling import HiddenGaussians
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
 from lidarpainter_models.gaussians.model.bending import REACH_M
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -219,7 +219,7 @@ class FitState:
     def seen(self, looks: Mapping[int, Sequence[View]]) -> SeenGaussians:
         """All Gaussians that any of these can show, as leaves for one step.
 
-        By view, as `hidden_gaussians` calls them, where it and its bodies stand, in one or more
+        By view, as `occlusion_culling` calls them, where it and its bodies stand, in one or more
         moments.
         """
         bent_m = REACH_M if len(self.scene.actors.bending.bodies) else 0.0

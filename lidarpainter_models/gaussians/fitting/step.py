@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.loss import (
     ACTOR_TERM_EVERY,
@@ -20,6 +19,7 @@ from lidarpainter_models.gaussians.fitting.loss import (
     painted_loss,
     recorded_loss,
 )
+from lidarpainter_models.gaussians.fitting.occlusion_culling import probed
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.model.drawing import OPAQUE
 from lidarpainter_models.gaussians.model.scene_rendering import PosedScene

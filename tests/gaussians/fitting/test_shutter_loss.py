@@ -13,7 +13,7 @@ import torch
 from fitted_street import FittedStreet
 
 from lidarpainter_models.gaussians.fitting.config import EffortConfig, FitConfig
-from lidarpainter_models.lidar.recording_faults import find_faults
+from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street

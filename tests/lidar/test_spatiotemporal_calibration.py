@@ -9,9 +9,13 @@ import torch
 from toy_street import ToyStreet
 
 from lidarpainter_models.geometry.cameras import Shutter
-from lidarpainter_models.lidar import recording_faults
 from lidarpainter_models.lidar.hub_images import ContrastImage
-from lidarpainter_models.lidar.recording_faults import Found, believed, cannot_be_told, find_faults
+from lidarpainter_models.lidar.spatiotemporal_calibration import (
+    Found,
+    believed,
+    cannot_be_told,
+    find_faults,
+)
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
@@ -68,7 +72,8 @@ def test_each_sweep_is_read_once_for_all_cameras(monkeypatch):
     driving = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 10.0]))
     moved = [replace(v, camera=replace(v.camera, shutter=driving)) for v in street.views]
     read, read_column = [], street.read_column
-    monkeypatch.setattr(recording_faults, "_edges_agree", lambda *_: True)  # a toy has no edges
+    edges_agree = "lidarpainter_models.lidar.spatiotemporal_calibration._edges_agree"
+    monkeypatch.setattr(edges_agree, lambda *_: True)  # a toy has no edges
     monkeypatch.setattr(
         street,
         "read_column",

@@ -5,7 +5,8 @@ import torch
 from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scene_of, training_view
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
-from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
+from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.occlusion_culling import (
     FIRST_LOOKS,
     LEAST_PX,
     LOOKS_BETWEEN,
@@ -13,7 +14,6 @@ from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
     HiddenGaussians,
     probed,
 )
-from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians

@@ -17,8 +17,8 @@ from gaussian_world import (
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.apply import edited
 from lidarpainter_models.editing.filled_scenes import filled
-from lidarpainter_models.editing.joins import OtherRun
 from lidarpainter_models.editing.motions import LogTimes
+from lidarpainter_models.editing.scene_merging import OtherRun
 from lidarpainter_models.editing.script import Join, Remove
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError
