@@ -28,7 +28,6 @@ from collections.abc import Iterable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
@@ -181,6 +180,8 @@ def _distance_px(
     if may_run_on_host(hit.device):
         if not bool(hit.any()):
             return torch.full(hit.shape, torch.inf)
+        from scipy.ndimage import distance_transform_edt  # likewise: not for settings
+
         return torch.as_tensor(distance_transform_edt(~hit.numpy())).float()
     height_px = hit.shape[0]
     row = torch.arange(height_px, device=hit.device, dtype=torch.float32)[:, None]

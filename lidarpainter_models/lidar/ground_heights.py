@@ -7,7 +7,6 @@ in glass and water).
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 NEIGHBOURS = 24
@@ -46,6 +45,8 @@ class GroundHeights:
         known_m = self._height_m[has_height].float()
         if known_m.numel() == 0 or xy_m.shape[0] == 0:
             return torch.full_like(xy_m[:, 0], torch.nan)
+        from scipy.spatial import cKDTree  # a third of a second, for who only reads settings
+
         tree = cKDTree(self._centres(self._cells[has_height]).numpy())
         count = min(NEIGHBOURS, known_m.numel())
         distance_m, nearest = tree.query(xy_m.numpy(), k=[*range(1, count + 1)])
