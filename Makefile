@@ -17,9 +17,10 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
 
-# two processes: half of the tests' time is waiting for what they start
+# two processes: half of the tests' time is waiting for what they start; a file's tests share what
+# they set up, so one process has them all
 test: lint
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # what takes too long for every change: runs killed and resumed, thousands of damaged logs
 nightly: $(INSTALLED) $(SYSTEM)
