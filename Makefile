@@ -17,10 +17,9 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
 
-# two processes: half of the tests' time is waiting for what they start; a file's tests share what
-# they set up, so one process has them all
+# two processes: half of the tests' time is waiting for what they start
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2
 
 # what takes too long for every change: runs killed and resumed, thousands of damaged logs
 nightly: $(INSTALLED) $(SYSTEM)
