@@ -101,7 +101,7 @@ def test_what_is_mistyped_imports_nothing_heavy(words, store):
 def test_a_wrong_setting_of_a_training_is_refused_soon(words, store):
     """The settings of a training lie beside its networks, which need torch."""
     spent, torch_alone = [], []
-    for _ in range(3):  # in turns: another job on these cores may double either
+    for _ in range(2):  # in turns: another job on these cores may double either
         seconds, answer = cpu_s("-m", "flows.cli", "--store", store.root, *words)
         spent.append(seconds)
         torch_alone.append(cpu_s("-c", "import torch")[0])

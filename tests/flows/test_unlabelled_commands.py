@@ -68,6 +68,7 @@ def test_poses_are_found_and_then_who_moves(store):
     assert "who moves" in succeed("label", written["written"], store=store).out
 
 
+@pytest.mark.slow
 def test_poses_and_boxes_that_are_there_are_judged_and_kept(store):
     told = succeed("localise", STREET, "--json", store=store).json
     assert told["translation_share"] < 0.01

@@ -144,5 +144,5 @@ def test_the_rasteriser_changes_the_fit_and_all_after_it_but_not_what_it_is_fitt
 
 
 def test_a_reader_changes_nothing_of_a_stored_scene(copied):
-    module = f"{LIBRARY}.readers.waymo.v1"
+    module = f"{LIBRARY}.readers.waymo.tfrecord"
     assert changed_by(copied, module, "return ", "return None or ") == set()

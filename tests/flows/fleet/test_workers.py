@@ -300,6 +300,7 @@ def test_a_fault_of_the_manifest_leaves_no_store(tmp_path, monkeypatch):
     assert not (tmp_path / "store").exists()
 
 
+@pytest.mark.slow
 def test_sequences_of_one_scene_are_told_apart(stubbed, tmp_path):
     path = write_stub_manifest(tmp_path, sequences=1)
     assert "seed of the fit" not in stubbed("run", path).out

@@ -37,7 +37,9 @@ def read(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("name", ["kitti, raw", "kitti, tracking"])
+@pytest.mark.parametrize(
+    "name", ["kitti, tracking", pytest.param("kitti, raw", marks=pytest.mark.slow)]
+)
 def test_doctor_accepts_a_street_in_either_layout(read, name):
     _, truth, scene = read(name)
     assert [check for check in check_scene(scene) if check.verdict != "ok"] == []
