@@ -31,9 +31,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
-from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera, Shutter
+from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.backends import may_run_on_host
+from lidarpainter_models.kernels.colour_sampling import in_any_image
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 WARP_WEIGHT = 0.9  # support of a pixel that two recorded images show alike
@@ -46,10 +47,9 @@ LIDAR_REACH_RAD = 0.006
 """Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
 ALPHA_RANGE = (0.5, 0.95)  # opacity where a surface starts to count, and where it counts fully
 REACHES = 12  # times its reach beyond which LiDAR supports nothing: exp(-12)
-CAMERAS_AT_ONCE = 8
-"""Recorded cameras that are asked together, those first that are likeliest to have seen a view."""
 LIKENESS_M = 8.0
-"""So much farther a camera may stand that looks in the direction of a view, not across it."""
+"""So much farther a camera may stand that looks in the direction of a view, not across it: those
+that are likeliest to have seen it are asked first."""
 NEAREST_M = 0.1  # nearer to a camera than this is nothing seen, as in `Camera.contains`
 MOST_PROJECTIONS = 2**24
 """Points times cameras projected in one go: a few hundred megabytes."""
@@ -76,43 +76,14 @@ def is_seen(
     cameras = list(recorded_cameras)
     if not may_run_on_host(depth_m.device):
         return _in_any(points_world, cameras).reshape(depth_m.shape)
+    if not cameras:
+        return torch.zeros_like(depth_m, dtype=torch.bool)
     pose = camera.world_from_camera.double()
-    poses = torch.stack([pose, *(one.world_from_camera.double() for one in cameras)])[1:]
+    poses = torch.stack([one.world_from_camera.double() for one in cameras])
     likely = (poses[:, :3, 2] @ pose[:3, 2]) * LIKENESS_M
     likely -= (poses[:, :3, 3] - pose[:3, 3]).norm(dim=1)
-    ordered = [cameras[row] for row in likely.argsort(descending=True).tolist()]
-    is_out = torch.ones(len(points_world), dtype=torch.bool)
-    for first in range(0, len(ordered), CAMERAS_AT_ONCE):
-        out = is_out.nonzero()[:, 0]
-        some = ordered[first : first + CAMERAS_AT_ONCE]
-        is_out[out] = ~_in_images(some, points_world[out]).any(dim=0)
-    return ~is_out.reshape(depth_m.shape)
-
-
-def _in_images(
-    cameras: Sequence[Camera], points_world: Float[Tensor, "points 3"]
-) -> Bool[Tensor, "cameras points"]:
-    """Which points fall into the image of each camera, as its shutter reads it.
-
-    What `Camera.project` and `contains` find one by one.
-    """
-    inverse = torch.stack([one.camera_from_world for one in cameras]).to(points_world)
-    lens = points_world.new_tensor([[[c.fx_px, c.fy_px], [c.cx_px, c.cy_px]] for c in cameras])
-    focal, middle = lens[:, None].unbind(2)
-    size = points_world.new_tensor([[[c.width_px, c.height_px]] for c in cameras])
-    shutters = [one.shutter or Shutter(twist_per_s=torch.zeros(6)) for one in cameras]
-    across_s = points_world.new_tensor([[one.across_s] for one in shutters])
-    twist = torch.stack([one.twist_per_s for one in shutters]).to(points_world)[:, None]
-    standing = points_world @ inverse[:, :3, :3].mT + inverse[:, None, :3, 3]
-    velocity = -torch.linalg.cross(twist[..., :3].expand_as(standing), standing) - twist[..., 3:]
-    points, rounds = standing, READ_ROUNDS * any(one.is_rolling for one in shutters)
-    uv = points[..., :2] / points[..., 2:] * focal + middle
-    for _ in range(rounds):
-        read_s = ((uv / size - 0.5).clamp(-0.5, 0.5) * across_s).sum(-1, keepdim=True)
-        points = standing + read_s * velocity
-        uv = points[..., :2] / points[..., 2:] * focal + middle
-    inside = ((uv >= 0) & (uv < size)).all(dim=-1)
-    return inside & (points[..., 2] > NEAREST_M)
+    packed = torch.stack([one.packed() for one in cameras])[likely.argsort(descending=True)]
+    return in_any_image(points_world, packed, NEAREST_M, READ_ROUNDS).reshape(depth_m.shape)
 
 
 def _projections(

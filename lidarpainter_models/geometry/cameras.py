@@ -97,6 +97,18 @@ class Camera:
         """Where the camera stands, metres."""
         return self.world_from_camera[:3, 3]
 
+    def packed(self) -> Float[Tensor, "26"]:
+        """What kernels read of a camera; float64.
+
+        Three rows of `camera_from_world`, fx, fy, cx, cy, width and height in pixels, the two
+        seconds of `Shutter.across_s`, and `Shutter.twist_per_s`, which is 0 without a shutter.
+        """
+        pose = self.camera_from_world
+        sizes = [self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.width_px, self.height_px]
+        across_s = (0.0, 0.0) if self.shutter is None else self.shutter.across_s
+        twist = torch.zeros(6) if self.shutter is None else self.shutter.twist_per_s
+        return torch.cat([pose[:3].flatten(), pose.new_tensor([*sizes, *across_s]), twist.to(pose)])
+
     def at(self, world_from_camera: Float[Tensor, "4 4"]) -> "Camera":
         """The same lens at another pose, where nothing was recorded: without a shutter."""
         return replace(self, world_from_camera=world_from_camera, shutter=None)

@@ -263,17 +263,15 @@ def _means_on(
     recent = torch.exp(-(points.age_s - newest_s) / RECENCY_S).clamp(min=1e-6)
     coloured = points.has_colour.to(torch.float32)[:, None]
     rgb = points.rgb_u8.to(torch.float32) / 255 * coloured
-    columns = [rgb, coloured, points.depth_m[:, None]]
-    image, _ = blend_points(
+    return blend_points(
         points.positions_uv,
         points.depth_m,
-        torch.cat(columns, dim=-1),
+        torch.cat([rgb, coloured, points.depth_m[:, None]], dim=-1),
         surface_depth_m,
         weight=recent,
         radius_px=points.radius_px,
         tolerance=SURFACE_TOLERANCE,
-    )
-    return image
+    )[0]
 
 
 def _touches(
@@ -282,10 +280,7 @@ def _touches(
     """Which points may lie on the surface of a pixel that they reach, and some more."""
     reach_px = math.ceil(float(points.radius_px.max())) if len(points.radius_px) else 0
     nearness = torch.where(surface_depth_m > 0, 1 / surface_depth_m, 0)  # 0 where there is none
-    farness = torch.where(surface_depth_m > 0, surface_depth_m, 0)
-    most, farthest_m = torch.nn.functional.max_pool2d(
-        torch.stack([nearness, farness]), 2 * reach_px + 1, 1, reach_px
-    )
+    most, farthest_m = _most_around(torch.stack([nearness, surface_depth_m]), reach_px)
     slack = 1 + SURFACE_TOLERANCE / (1 - SURFACE_TOLERANCE) + 1e-4  # of rounding
     is_near = points.depth_m <= slack * _at(farthest_m, points)
     return is_near & (points.depth_m * _at(most, points) * slack >= 1)
@@ -344,7 +339,12 @@ def surface_gaps(
 
 def spread(mask: Bool[Tensor, "height width"], reach_px: int) -> Bool[Tensor, "height width"]:
     """Pixels with a marked one in the square around them."""
-    pool = torch.nn.functional.max_pool2d
-    side_px = 2 * reach_px + 1
-    along_rows = pool(mask.float()[None], (1, side_px), 1, (0, reach_px))
-    return pool(along_rows, (side_px, 1), 1, (reach_px, 0))[0] > 0
+    return _most_around(mask.float()[None], reach_px)[0] > 0
+
+
+def _most_around(
+    images: Float[Tensor, "images height width"], reach_px: int
+) -> Float[Tensor, "images height width"]:
+    """The largest value in the square around each pixel."""
+    pool, side_px = torch.nn.functional.max_pool2d, 2 * reach_px + 1
+    return pool(pool(images, (1, side_px), 1, (0, reach_px)), (side_px, 1), 1, (reach_px, 0))

@@ -4,7 +4,6 @@ The street stands in the world; an actor's points stand where its box is at the 
 camera z in metres. The grid is coarse: its cells follow an angle, not the pixels of the image.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.colour_sampling import project_inside
+from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera
+from lidarpainter_models.kernels.colour_sampling import project_inside, read_inside
 from lidarpainter_models.lidar.actor_separation import poses_at
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
@@ -28,10 +27,6 @@ NEAR_M = 0.5  # points nearer to the camera plane than this are left out
 POINTS_AT_ONCE = 1 << 16
 """Points of the map that are looked at before those that matter of them are kept: all that an image
 of a long log holds are many times as many."""
-
-READ_MARGIN = 0.25
-"""How far beside a rolling shutter's image, in parts of its size, what stands may be and yet be
-read in it: at 30 m/s and 30 ms all that is 1 m before the camera or further."""
 
 PlacedActors = Mapping[str, tuple[ActorTrack, Float[Tensor, "4 4"]]]
 """The tracks present at one time by actor id, with `world_from_box` then."""
@@ -208,27 +203,16 @@ def read_in_image(
     Points that stand still in the world are where a rolling shutter reads them, others where they
     are in the middle of it.
     """
-    rolls = stand_still and camera.shutter is not None and camera.shutter.is_rolling
+    if stand_still and camera.shutter is not None and camera.shutter.is_rolling:
+        return read_inside(xyz_m, camera.packed(), margin_px, NEAR_M, READ_ROUNDS)
     image = with_margin(camera, margin_px, margin_px)
-    window = image
-    if rolls:
-        aside_px, above_px = (
-            math.ceil(READ_MARGIN * size) for size in (camera.width_px, camera.height_px)
-        )
-        window = with_margin(image, aside_px, above_px)
     lens = torch.tensor(
-        [[window.fx_px, 0, window.cx_px], [0, window.fy_px, window.cy_px], [0, 0, 1]],
+        [[image.fx_px, 0, image.cx_px], [0, image.fy_px, image.cy_px], [0, 0, 1]],
         dtype=torch.float64,
     )
-    rows, pixels_uv, depth_m = project_inside(
-        xyz_m, lens @ camera_from_points[:3], window.width_px, window.height_px, NEAR_M
+    return project_inside(
+        xyz_m, lens @ camera_from_points[:3], image.width_px, image.height_px, NEAR_M
     )
-    if rolls:
-        read_uv, read_m = camera.project(xyz_m[rows].double())
-        read_uv, read_m = (read_uv + margin_px).to(pixels_uv), read_m.to(depth_m)
-        is_read = image.contains(read_uv, read_m, near_m=NEAR_M)
-        rows, pixels_uv, depth_m = rows[is_read], read_uv[is_read], read_m[is_read]
-    return rows, pixels_uv, depth_m
 
 
 def with_margin(camera: Camera, aside_px: int, above_px: int) -> Camera:

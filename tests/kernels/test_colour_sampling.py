@@ -1,16 +1,23 @@
 """Colours of points: the numba loops against plain torch in double."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera, Shutter
 from lidarpainter_models.kernels.colour_sampling import (
+    READ_MARGIN,
     SLOTS,
     BestSamples,
     combine_samples,
+    in_any_image,
     insert_samples,
     project_inside,
+    read_inside,
     sample_levels,
     steps_inside,
 )
@@ -36,6 +43,49 @@ def test_the_same_points_fall_into_the_image(count):
     # sums of terms up to focal length times 10 m over at least half a metre of depth
     assert np.abs(fast[1] - plain[1]).max(initial=0) <= 4 * EPS * (40 * 10 / 0.5)
     assert np.abs(fast[2] - plain[2]).max(initial=0) <= 4 * EPS * 10.5
+
+
+def turning_camera(yaw_rad=0.0):
+    """At 20 m/s, turning, read from the top to the bottom within 30 ms."""
+    twist = torch.tensor([0.02, -0.3, 0.05, 0.5, 0.1, 20.0])
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 0] = pose[2, 2] = math.cos(yaw_rad)
+    pose[0, 2], pose[2, 0] = math.sin(yaw_rad), -math.sin(yaw_rad)
+    camera = Camera.centred(pose, 40.0, width_px=64, height_px=48)
+    return replace(camera, shutter=Shutter(across_s=(0.002, 0.03), twist_per_s=twist))
+
+
+@pytest.mark.parametrize("margin_px", [0, 5])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_a_rolling_shutter_reads_is_where_its_camera_projects_it(backend, margin_px):
+    camera = turning_camera(0.2)
+    points = torch.from_numpy(rng(3).uniform(-30, 30, (4000, 3)).astype(np.float32))
+    found = read_inside(points, camera.packed(), margin_px, 0.5, READ_ROUNDS, backend=backend)
+    rows, pixels_uv, depth_m = found
+    at_uv, at_m = camera.project(points.double())
+    assert 100 < len(rows) < 4000
+    assert pixels_uv.numpy() == pytest.approx((at_uv[rows] + margin_px).numpy(), abs=1e-3)
+    assert depth_m.numpy() == pytest.approx(at_m[rows].numpy(), rel=1e-5)
+    inside = ((at_uv >= -margin_px) & (at_uv < torch.tensor([64, 48]) + margin_px)).all(dim=1)
+    middle_uv, middle_m = replace(camera, shutter=None).project(points.double())
+    # what is so near that it crosses a quarter of the image meanwhile is left out
+    size = torch.tensor([64, 48]) + 2 * margin_px
+    near = (((middle_uv + margin_px) / size - 0.5).abs() <= 0.5 + READ_MARGIN).all(dim=1)
+    expected = inside & near & (middle_m >= 0.5) & (at_m > 0.5)
+    assert rows.tolist() == expected.nonzero()[:, 0].tolist()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_point_is_in_any_image_that_reads_it(backend):
+    cameras = [turning_camera(yaw) for yaw in (0.0, 1.5)] + [
+        replace(turning_camera(3), shutter=None)
+    ]
+    points = torch.from_numpy(rng(4).uniform(-30, 30, (3000, 3)).astype(np.float32))
+    packed = torch.stack([camera.packed() for camera in cameras])
+    found = in_any_image(points, packed, 0.1, READ_ROUNDS, backend=backend)
+    seen = [camera.contains(*camera.project(points.double())) for camera in cameras]
+    assert 0.1 < float(found.float().mean()) < 0.9
+    assert torch.equal(found, torch.stack(seen).any(dim=0))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

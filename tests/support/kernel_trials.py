@@ -16,11 +16,11 @@ from lit_surfaces import random_scene
 from splat_drawing import SPLATS
 from torch import Tensor
 
-from lidarpainter_models.geometry.cameras import Shutter
+from lidarpainter_models.geometry.cameras import READ_ROUNDS, Camera, Shutter
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.box_owners import box_owners
-from lidarpainter_models.kernels.colour_sampling import project_inside
+from lidarpainter_models.kernels.colour_sampling import project_inside, read_inside
 from lidarpainter_models.kernels.frustum_culling import Blocks, mark_seen, refresh_bounds
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, render_gaussians
 from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, pixel_terms
@@ -172,7 +172,13 @@ def _projection(backend: Backend, device: torch.device) -> list[Tensor]:
     inside[rows] = True
     seen = torch.zeros_like(points)
     seen[rows] = torch.cat([pixels_uv, depth_m[:, None]], dim=1)
-    return [inside, seen]
+    camera = Camera.centred(torch.eye(4).double(), 80.0, width_px=width_px, height_px=height_px)
+    shutter = Shutter(across_s=(0.0, 0.03), twist_per_s=torch.tensor([0, 0.3, 0, 0, 0, 20.0]))
+    packed = replace(camera, shutter=shutter).packed()
+    rows, pixels_uv, depth_m = read_inside(points, packed, 4, 0.5, READ_ROUNDS, backend=backend)
+    read = torch.zeros_like(points)
+    read[rows] = torch.cat([pixels_uv, depth_m[:, None]], dim=1)
+    return [inside, seen, read]
 
 
 def _image_loss(backend: Backend, device: torch.device) -> list[Tensor]:

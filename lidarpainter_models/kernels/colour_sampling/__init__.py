@@ -18,6 +18,9 @@ from lidarpainter_models.kernels.backends import Backend, implementation
 _CPU = torch.device("cpu")
 SLOTS = 4
 """Best samples that a point keeps."""
+READ_MARGIN = 0.25
+"""How far beside a rolling shutter's image, in parts of its size, what stands may be and yet be
+read in it: at 30 m/s and 30 ms all that is 1 m before the camera or further."""
 AGREEMENT = 32.0
 """Samples further than this (of 255, in any channel) from the typical one are outliers."""
 
@@ -67,6 +70,58 @@ def project_inside(
         xyz_m, pixels_from_points, width_px, height_px, near_m
     )
     return found
+
+
+def read_inside(
+    xyz_m: Float[Tensor, "points 3"],
+    camera: Float[Tensor, "26"],
+    margin_px: float,
+    near_m: float,
+    rounds: int,
+    *,
+    backend: Backend = "auto",
+) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
+    """Like `project_inside`, of points that stand while a rolling shutter reads the image.
+
+    Pixels are those of the image with its margin; `camera` is `Camera.packed`. Where a point is
+    read is guessed so many rounds again, from the middle of the image's time.
+
+    Raises:
+        ShapeError: the points or the camera have another shape.
+    """
+    if xyz_m.ndim != 2 or xyz_m.shape[1] != 3 or camera.shape != (26,):
+        raise ShapeError(
+            f"need points (points, 3) and a camera of 26 numbers, got {tuple(xyz_m.shape)} and "
+            f"{tuple(camera.shape)}"
+        )
+    read = implementation("colour_sampling", "read_inside", backend, xyz_m.device)
+    found: tuple[Tensor, Tensor, Tensor] = read(xyz_m, camera, margin_px, near_m, rounds)
+    return found
+
+
+def in_any_image(
+    xyz_m: Float[Tensor, "points 3"],
+    cameras: Float[Tensor, "cameras 26"],
+    near_m: float,
+    rounds: int,
+    *,
+    backend: Backend = "auto",
+) -> Bool[Tensor, " points"]:
+    """Whether each point falls into the image of a camera, as its shutter reads it.
+
+    The cameras (`Camera.packed`) are asked in their order, none after one that has the point.
+
+    Raises:
+        ShapeError: the points or the cameras have another shape.
+    """
+    if xyz_m.ndim != 2 or xyz_m.shape[1] != 3 or cameras.shape[1:] != (26,):
+        raise ShapeError(
+            f"need points (points, 3) and cameras of 26 numbers, got {tuple(xyz_m.shape)} and "
+            f"{tuple(cameras.shape)}"
+        )
+    ask = implementation("colour_sampling", "in_any_image", backend, xyz_m.device)
+    inside: Tensor = ask(xyz_m, cameras, near_m, rounds)
+    return inside
 
 
 def insert_samples(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.colour_sampling import AGREEMENT, SLOTS, BestSamples
+from lidarpainter_models.kernels.colour_sampling import AGREEMENT, READ_MARGIN, SLOTS, BestSamples
 
 
 def project_inside(
@@ -47,6 +47,103 @@ def _project_inside(
             depth_m[count] = depth
             count += 1
     return rows[:count].copy(), pixels_uv[:count].copy(), depth_m[:count].copy()
+
+
+def read_inside(
+    xyz_m: Tensor, camera: Tensor, margin_px: float, near_m: float, rounds: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `colour_sampling.read_inside`."""
+    found = _read_inside(xyz_m.contiguous().numpy(), camera.numpy(), margin_px, near_m, rounds)
+    rows, pixels_uv, depth_m = (torch.from_numpy(column) for column in found)
+    return rows, pixels_uv, depth_m
+
+
+def in_any_image(xyz_m: Tensor, cameras: Tensor, near_m: float, rounds: int) -> Tensor:
+    """See `colour_sampling.in_any_image`."""
+    inside = _in_any_image(xyz_m.contiguous().numpy(), cameras.numpy(), near_m, rounds)
+    return torch.from_numpy(inside)
+
+
+@numba.njit(cache=True, nogil=True)
+def _standing(camera: np.ndarray, xyz_m: np.ndarray) -> tuple[float, float, float]:
+    """A point in the camera's frame in the middle of its image; float64."""
+    x, y, z = np.float64(xyz_m[0]), np.float64(xyz_m[1]), np.float64(xyz_m[2])
+    return (
+        camera[0] * x + camera[1] * y + camera[2] * z + camera[3],
+        camera[4] * x + camera[5] * y + camera[6] * z + camera[7],
+        camera[8] * x + camera[9] * y + camera[10] * z + camera[11],
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _pixel(camera: np.ndarray, x: float, y: float, z: float) -> tuple[float, float]:
+    """Where a point of the camera's frame is seen."""
+    depth = z if abs(z) >= 1e-9 else 1e-9
+    return x / depth * camera[12] + camera[14], y / depth * camera[13] + camera[15]
+
+
+@numba.njit(cache=True, nogil=True)
+def _read(
+    camera: np.ndarray, x: float, y: float, z: float, rounds: int
+) -> tuple[float, float, float]:
+    """Pixel and depth of a standing point where the shutter reads it; see `Camera.project`."""
+    turn_x, turn_y, turn_z = camera[20], camera[21], camera[22]
+    velocity_x = turn_z * y - turn_y * z - camera[23]
+    velocity_y = turn_x * z - turn_z * x - camera[24]
+    velocity_z = turn_y * x - turn_x * y - camera[25]
+    (u, v), depth = _pixel(camera, x, y, z), z
+    for _ in range(rounds):
+        across = min(max(u / camera[16] - 0.5, -0.5), 0.5)
+        down = min(max(v / camera[17] - 0.5, -0.5), 0.5)
+        after_s = camera[18] * across + camera[19] * down
+        depth = z + after_s * velocity_z
+        u, v = _pixel(camera, x + after_s * velocity_x, y + after_s * velocity_y, depth)
+    return u, v, depth
+
+
+@numba.njit(cache=True, nogil=True)
+def _read_inside(
+    xyz_m: np.ndarray, camera: np.ndarray, margin_px: float, near_m: float, rounds: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, continuous pixels (rows, 2) and depth of the points that an image is read with."""
+    width_px, height_px = camera[16] + 2 * margin_px, camera[17] + 2 * margin_px
+    aside_px, above_px = READ_MARGIN * width_px, READ_MARGIN * height_px
+    rows = np.empty(xyz_m.shape[0], dtype=np.int64)
+    pixels_uv = np.empty((xyz_m.shape[0], 2), dtype=np.float32)
+    depth_m = np.empty(xyz_m.shape[0], dtype=np.float32)
+    count = 0
+    for i in range(xyz_m.shape[0]):
+        x, y, z = _standing(camera, xyz_m[i])
+        if z < near_m:
+            continue
+        u, v = _pixel(camera, x, y, z)
+        u, v = u + margin_px, v + margin_px
+        if not (-aside_px <= u < width_px + aside_px and -above_px <= v < height_px + above_px):
+            continue
+        u, v, read_m = _read(camera, x, y, z, rounds)
+        # as they are given on: what rounds up to the edge is outside
+        u_px, v_px = np.float32(u + margin_px), np.float32(v + margin_px)
+        if read_m > near_m and 0 <= u_px < width_px and 0 <= v_px < height_px:
+            rows[count] = i
+            pixels_uv[count, 0], pixels_uv[count, 1] = u_px, v_px
+            depth_m[count] = read_m
+            count += 1
+    return rows[:count].copy(), pixels_uv[:count].copy(), depth_m[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_any_image(xyz_m: np.ndarray, cameras: np.ndarray, near_m: float, rounds: int) -> np.ndarray:
+    """Whether each point falls into an image, of the cameras in their order."""
+    inside = np.zeros(xyz_m.shape[0], dtype=np.bool_)
+    for i in range(xyz_m.shape[0]):
+        for number in range(cameras.shape[0]):
+            camera = cameras[number]
+            x, y, z = _standing(camera, xyz_m[i])
+            u, v, depth_m = _read(camera, x, y, z, rounds)
+            if depth_m > near_m and 0 <= u < camera[16] and 0 <= v < camera[17]:
+                inside[i] = True
+                break
+    return inside
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

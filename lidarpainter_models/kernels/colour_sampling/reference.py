@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.colour_sampling import AGREEMENT, SLOTS, BestSamples
+from lidarpainter_models.kernels.colour_sampling import AGREEMENT, READ_MARGIN, SLOTS, BestSamples
 
 
 def project_inside(
@@ -19,6 +19,51 @@ def project_inside(
     rows = inside.nonzero()[:, 0]
     pixels_uv = torch.stack([u, v], dim=1).index_select(0, rows)
     return rows, pixels_uv, depth_m.index_select(0, rows).float()
+
+
+def read_inside(
+    xyz_m: Tensor, camera: Tensor, margin_px: float, near_m: float, rounds: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `colour_sampling.read_inside`."""
+    size = camera[16:18].to(xyz_m.device, non_blocking=True) + 2 * margin_px
+    standing_uv, standing_m, read_uv, read_m = _read(xyz_m, camera, rounds)
+    standing_uv, read_uv = standing_uv + margin_px, (read_uv + margin_px).float()
+    near = (standing_uv >= -READ_MARGIN * size) & (standing_uv < (1 + READ_MARGIN) * size)
+    inside = (read_uv >= 0) & (read_uv < size) & near
+    is_read = inside.all(dim=1) & (standing_m >= near_m) & (read_m > near_m)
+    rows = is_read.nonzero()[:, 0]
+    return rows, read_uv.index_select(0, rows), read_m.index_select(0, rows).float()
+
+
+def in_any_image(xyz_m: Tensor, cameras: Tensor, near_m: float, rounds: int) -> Tensor:
+    """See `colour_sampling.in_any_image`."""
+    inside = torch.zeros_like(xyz_m[:, 0], dtype=torch.bool)
+    for camera in cameras:
+        _, _, uv, depth_m = _read(xyz_m, camera, rounds)
+        size = camera[16:18].to(xyz_m.device, non_blocking=True)
+        inside |= ((uv >= 0) & (uv < size)).all(dim=1) & (depth_m > near_m)
+    return inside
+
+
+def _read(xyz_m: Tensor, camera: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixel and depth of points in the middle of an image, then where its shutter reads them."""
+    camera = camera.to(xyz_m.device, non_blocking=True)
+    matrix, focal, middle = camera[:12].view(3, 4), camera[12:14], camera[14:16]
+    size, across_s, (turn, speed) = camera[16:18], camera[18:20], camera[20:].split(3)
+    standing = xyz_m.double() @ matrix[:, :3].T + matrix[:, 3]
+    velocity = -torch.linalg.cross(turn.expand_as(standing), standing) - speed
+    standing_uv = uv = _pixels(standing, focal, middle)
+    points = standing
+    for _ in range(rounds):
+        after_s = ((uv / size - 0.5).clamp(-0.5, 0.5) * across_s).sum(dim=1, keepdim=True)
+        points = standing + after_s * velocity
+        uv = _pixels(points, focal, middle)
+    return standing_uv, standing[:, 2], uv, points[:, 2]
+
+
+def _pixels(points: Tensor, focal: Tensor, middle: Tensor) -> Tensor:
+    depth = points[:, 2:]
+    return points[:, :2] / torch.where(depth.abs() < 1e-9, 1e-9, depth) * focal + middle
 
 
 def insert_samples(
