@@ -22,7 +22,7 @@ WHOLE_VIEWS = 0.33
 """A training view's part of new surface, about: the fit finds out and corrects it."""
 COMPILING_S = {
     "prepare": 14.0,
-    "fit": 165.0,
+    "fit": 85.0,
     "paint-1": 3.4,
     "examine": 4.7,
     "evaluate-unpainted": 3.7,
@@ -36,15 +36,18 @@ PRIOR_SHARE = 0.03
 """Part of a run that must be over before its own pace counts as much as what was expected."""
 MOST_COMPILED_S = 0.5
 """Compiling in one part of a stage, from which on that part says nothing about the speed."""
-FIRST_SHARE = 0.2
+FIRST_SHARE = 0.17
 """Part of a run after which its end is foretold where no past run tells."""
 
 
-def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> dict[str, float]:
+def reference_seconds(
+    parameters: "ReconstructParameters", num_views: float, num_recorded: float | None = None
+) -> dict[str, float]:
     """Return what every stage of a run takes on one core of the reference machine, in order.
 
-    Weights were measured on PandaSet 002 and a synthetic street, 160 and 480 pixels wide, 6 and 14
-    training views; kernels are compiled already. `num_views` are recorded images of its cameras.
+    Weights were measured on PandaSet 002 and KITTI 0005, 480 pixels wide, and a synthetic street of
+    160, 10 to 16 training views; kernels are compiled already. `num_views` are recorded images of
+    its cameras, `num_recorded` those of all cameras of the recording.
     """
     pixels = parameters.observation.width_px**2 * 9 / 16
     train = num_views if parameters.split == "all" else num_views / 2
@@ -58,28 +61,36 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
     paints = any(name.startswith("paint-") for name in parameters.stages)
     of_round = len(parameters.novel.shifts) / max(parameters.rounds, 1) + 0.5
     painted = ceil(train / parameters.novel.every_nth) * of_round
+    step_s = 0.005 + 2.6e-7 * pixels
+    truths_s = 1.0 + 5e-6 * pixels if has_truth else 0.0
     kinds = {
-        "prepare": num_views * (0.35 + 1e-6 * pixels),
-        "fit": 2.0 + 0.15 * train + steps("fit") * (0.012 + 6e-7 * pixels),
-        "paint": painted * (0.35 + 1e-5 * pixels),
-        "refine": steps("refine") * (0.012 + 6e-7 * pixels) * (1.6 if paints else 1.0)
-        + (6.0 if paints else 0.0),
-        "examine": 2.0 + 1.2 * num_views,
-        "evaluate": test * (0.5 + 5e-6 * pixels) * (2.0 if has_truth else 1.0),
-        "envelope": 3.5 + 0.3 * test,
+        "prepare": num_views * (0.35 + 1.6e-6 * pixels),
+        "fit": 2.0 + 0.15 * train + steps("fit") * step_s,
+        "paint": painted * (0.1 + 6e-6 * pixels),
+        "refine": steps("refine") * step_s * (2.0 if paints else 1.0) + (6.0 if paints else 0.0),
+        "examine": 6.0 + 0.27 * (num_recorded or num_views),
+        "evaluate": test * (0.3 + 1.2e-6 * pixels + truths_s),
+        "envelope": 0.5 + test * (0.15 + 2.3e-6 * pixels),
         "lidar": 20.0 + 7.0 * train / max(len(parameters.train_cameras or ()), 1),
-        "report": 3.0,
+        "report": 1.5 + 4e-5 * pixels,
     }
-    return {name: kinds[_kind(name)] for name in parameters.stages}
+    told = {name: kinds[_kind(name)] for name in parameters.stages}
+    if has_truth and (first := next((n for n in told if _kind(n) == "evaluate"), None)):
+        told[first] += test * 2e-5 * pixels  # it draws what the others compare with
+    return told
 
 
 def expected_seconds(
-    parameters: "ReconstructParameters", num_views: float, past: Iterable[Mapping[str, Any]]
+    parameters: "ReconstructParameters",
+    num_views: float,
+    past: Iterable[Mapping[str, Any]],
+    num_recorded: float | None = None,
 ) -> tuple[dict[str, float], bool]:
     """Return what every stage of a run will take here, and whether a past run tells.
 
-    Past runs are rows of the table `runs`, each with the `num_views` of its scene and cameras; the
-    newest complete one with parameters of this version tells of each kind of stage.
+    Past runs are rows of the table `runs`, each with the `num_views` of its scene and cameras and
+    the `num_recorded` of its scene, if they are known; the newest complete one with parameters of
+    this version tells of each kind of stage.
     """
     from pydantic import ValidationError
 
@@ -92,13 +103,13 @@ def expected_seconds(
             were = ReconstructParameters.model_validate_json(row["parameters"] or "{}")
         except ValidationError:
             continue
-        reference = reference_seconds(were, row["num_views"])
+        reference = reference_seconds(were, row["num_views"], row.get("num_recorded"))
         took = json.loads(row["stage_seconds"] or "{}")
         for kind in {_kind(name) for name in reference} - paces.keys():
             stages = [name for name in reference if _kind(name) == kind and name in took]
             if stages:
                 paces[kind] = sum(took[s] for s in stages) / sum(reference[s] for s in stages)
-    expected = reference_seconds(parameters, num_views)
+    expected = reference_seconds(parameters, num_views, num_recorded)
     usual = sum(paces.values()) / len(paces) if paces else 1.0
     told = {name: seconds * paces.get(_kind(name), usual) for name, seconds in expected.items()}
     return told, bool(paces)

@@ -35,8 +35,8 @@ def run_reconstruction(
 
     check_inputs(parameters, store.address)  # before a server is started for nothing
     scene = next((r for r in store.rows("scenes") if r["scene_id"] == parameters.scene), None)
-    num_views = _num_views(scene, parameters.train_cameras)
-    with _running(store, parameters, num_views) as listener, ExitStack() as stack:
+    num_views = _num_views(scene, parameters.train_cameras), _num_views(scene, None)
+    with _running(store, parameters, *num_views) as listener, ExitStack() as stack:
         if is_watched:
             from lidarpainter_models.viewing.watching import watching
 
@@ -52,22 +52,27 @@ def run_demo(
     from flows.demo import demo, demo_street
 
     street = demo_street(seed)
-    with _running(store, parameters, street.num_frames * len(street.cameras)):
+    num_views = street.num_frames * len(street.cameras)
+    with _running(store, parameters, num_views, num_views):
         return demo(street, parameters, store.address, first_image)
 
 
 @contextmanager
 def _running(
-    store: Store, parameters: "ReconstructParameters", num_views: float
+    store: Store, parameters: "ReconstructParameters", num_views: float, num_recorded: float
 ) -> Iterator[ProgressListener]:
-    """Start a server, and show the stages of a run whose scene has so many views."""
+    """Start a server, and show the stages of a run of so many views, of all that are recorded."""
     store.make()
     scenes = {row["scene_id"]: row for row in store.rows("scenes")}
-    past = [
-        {**row, "num_views": _num_views(scenes.get(row["scene_id"]), _cameras(row))}
-        for row in store.rows("runs")
-    ]
-    expected, is_told = expected_seconds(parameters, num_views, past)
+    past = []
+    for row in store.rows("runs"):
+        scene = scenes.get(row["scene_id"])
+        counts = {
+            "num_views": _num_views(scene, _cameras(row)),
+            "num_recorded": _num_views(scene, None),
+        }
+        past.append(row | counts)
+    expected, is_told = expected_seconds(parameters, num_views, past, num_recorded)
     say_status(SERVER)
     log = store.root / "logs" / "prefect.log"
     with prefect_server(log), shown_progress(expected, is_told_by_past=is_told) as listener:

@@ -264,7 +264,8 @@ def test_a_real_first_run_is_told_right_from_its_first_fifth_on(path):
     recorded = json.loads(path.read_text("ascii"))
     events = recorded["events"]
     settings = with_overrides(preset(recorded["preset"], recorded["scene"]), recorded["settings"])
-    expected, _ = expected_seconds(settings, recorded["num_views"], [])
+    counts = recorded["num_views"], [], recorded["num_recorded"]
+    expected, _ = expected_seconds(settings, *counts)
     at = [0.0, 0.0]
     clock = Clock(expected=expected, now=lambda: at[0], compiled=lambda: at[1])
     end_s, tried = events[-1][0], 0
