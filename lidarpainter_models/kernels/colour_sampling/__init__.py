@@ -1,7 +1,8 @@
 """Colours of points from images: project, take samples, keep the best, combine them.
 
 Arrays in, arrays out, on the CPU: what is kept of millions of points is changed in place.
-Projections alone are asked for on any device. Pixels are continuous, the top-left one has its centre at (0.5, 0.5); depth is camera z.
+Projections alone are asked for on any device. Pixels are continuous, the top-left one has its
+centre at (0.5, 0.5); depth is camera z.
 """
 
 from typing import NamedTuple
