@@ -65,8 +65,12 @@ class CameraTurn:
     def is_wrong(self) -> bool:
         """Whether a turn that stands out is larger than sound cameras show."""
         turned_deg = max(abs(self.yaw_deg), abs(self.pitch_deg))
-        is_turned = self.peak >= MIN_PEAK and turned_deg > MAX_TURN_DEG
-        return is_turned or (self.roll_peak >= MIN_PEAK and abs(self.roll_deg) > MAX_TURN_DEG)
+        return (self.peak >= MIN_PEAK and turned_deg > MAX_TURN_DEG) or self.is_rolled
+
+    @property
+    def is_rolled(self) -> bool:
+        """Whether a roll that stands out is larger than sound cameras show."""
+        return self.roll_peak >= MIN_PEAK and abs(self.roll_deg) > MAX_TURN_DEG
 
     def __str__(self) -> str:
         yaw_pitch = f"yaw {self.yaw_deg:+.2f} pitch {self.pitch_deg:+.2f}"
@@ -140,20 +144,30 @@ def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
 
 
 def best_turn(images: Sequence[EdgeImage]) -> CameraTurn:
-    """The turn of a camera that puts depth edges on image edges."""
-    turns_deg = np.stack(np.meshgrid(_TURNS_DEG, _TURNS_DEG, 0.0, indexing="ij"), axis=-1)
+    """The turn of a camera that puts depth edges on image edges.
+
+    A roll that stands out may have been taken for a pitch or yaw before it was known, so these are
+    sought again with it.
+    """
+    turn = _turn_around(images, 0.0)
+    return _turn_around(images, turn.roll_deg) if turn.is_rolled else turn
+
+
+def _turn_around(images: Sequence[EdgeImage], roll_deg: float) -> CameraTurn:
+    """The best yaw and pitch of a camera rolled by so much, then the best roll."""
+    turns_deg = np.stack(np.meshgrid(_TURNS_DEG, _TURNS_DEG, roll_deg, indexing="ij"), axis=-1)
     plane = edge_scores(images, turns_deg.reshape(-1, 3)).reshape(turns_deg.shape[:2])
     row, column = np.unravel_index(plane.argmax(), plane.shape)
     yaw_deg, pitch_deg = _TURNS_DEG[column], _TURNS_DEG[row]
     line = max(_roll_scores(images, pitch_deg, yaw_deg), _roll_scores(images, 0, 0), key=max)
-    roll_deg = _ROLLS_DEG[line.argmax()]
+    best_roll_deg = _ROLLS_DEG[line.argmax()]
     apart = np.hypot(_TURNS_DEG[None] - yaw_deg, _TURNS_DEG[:, None] - pitch_deg)
     return CameraTurn(
         yaw_deg=float(yaw_deg),
         pitch_deg=float(pitch_deg),
         peak=_peak(plane, apart > _PEAK_WIDTH_DEG),
-        roll_deg=float(roll_deg),
-        roll_peak=_peak(line, np.abs(_ROLLS_DEG - roll_deg) > _ROLL_PEAK_WIDTH_DEG),
+        roll_deg=float(best_roll_deg),
+        roll_peak=_peak(line, np.abs(_ROLLS_DEG - best_roll_deg) > _ROLL_PEAK_WIDTH_DEG),
     )
 
 
