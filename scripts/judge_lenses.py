@@ -26,14 +26,14 @@ from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.serving.image_formats import Encoding
-from lidarpainter_models.serving.messages import SensorRequest
-from lidarpainter_models.serving.renderer import ServedScene
-from lidarpainter_models.serving.sensor_cameras import (
+from lidarpainter_models.serving.lens_models import (
     PinholeLens,
     RadialLens,
     RisingCurve,
     SensorCamera,
 )
+from lidarpainter_models.serving.messages import SensorRequest
+from lidarpainter_models.serving.renderer import ServedScene
 from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig, write_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 

@@ -18,7 +18,7 @@ from catalog.errors import CatalogError, StorageError
 from catalog.fleets import FleetLedger
 from catalog.retries import Ending
 from catalog.store import open_store
-from flows.fleet.causes import is_storage_away
+from flows.fleet.error_causes import is_storage_away
 from flows.fleet.status import counts_of
 from flows.server import start_child
 

@@ -22,7 +22,7 @@ from catalog.leases import Holder, Lease
 from catalog.retries import Ending, attempt_id
 from catalog.tables import Row
 from flows.fleet.asked import Asked
-from flows.fleet.causes import cause_of, is_storage_away
+from flows.fleet.error_causes import cause_of, is_storage_away
 from flows.fleet.flow_runs import api_lost
 from flows.fleet.heartbeat import Heartbeat
 from flows.fleet.limits import admits, fits_beside, lacks_disk, over_budget, work_here

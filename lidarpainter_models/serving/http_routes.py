@@ -22,11 +22,11 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, LidarPainterError
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track, is_rigid
 from lidarpainter_models.serving.image_formats import Encoding, encoded
+from lidarpainter_models.serving.lens_models import SensorCamera
 from lidarpainter_models.serving.messages import SensorRequest
 from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.renderer import Frame, ServedScene
-from lidarpainter_models.serving.sensor_cameras import SensorCamera
 from lidarpainter_models.serving.trust import metadata
 
 if TYPE_CHECKING:

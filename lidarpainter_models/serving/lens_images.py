@@ -26,7 +26,7 @@ from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.row_motion.reference import ReadingTimes, motion_by_times
-from lidarpainter_models.serving.sensor_cameras import SensorCamera
+from lidarpainter_models.serving.lens_models import SensorCamera
 
 ONE_FACE_RAD = math.radians(55)
 """Half of 110 degrees: beyond it one pinhole image has too many pixels at its rim."""

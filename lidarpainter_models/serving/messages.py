@@ -21,11 +21,11 @@ from lidarpainter_models.geometry.transforms import (
     rigid_from_rotation,
     rotation_from_quaternion,
 )
+from lidarpainter_models.serving.camera_messages import checked_size, sensor_camera
 from lidarpainter_models.serving.image_formats import Encoding, encoding_of
+from lidarpainter_models.serving.lens_models import SensorCamera
 from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.refusals import invalid
-from lidarpainter_models.serving.requested_lenses import checked_size, sensor_camera
-from lidarpainter_models.serving.sensor_cameras import SensorCamera
 
 MOST_ACTORS = 4096
 """Of one request."""

@@ -35,6 +35,7 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
+from lidarpainter_models.serving.lens_models import SensorCamera
 from lidarpainter_models.serving.messages import SensorRequest, TimedRequest
 from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.placed_actors import (
@@ -46,7 +47,6 @@ from lidarpainter_models.serving.placed_actors import (
     twists_of,
 )
 from lidarpainter_models.serving.refusals import RequestError, invalid
-from lidarpainter_models.serving.sensor_cameras import SensorCamera
 from lidarpainter_models.serving.trust import EnvelopeDistance, Trust
 
 SAME_TIME_NS = 1_500

@@ -18,8 +18,8 @@ from bench_machine import best_cpu_s
 from served_street import ServedStreet
 from tiny_street import tiny_street
 
+from lidarpainter_models.serving.lens_models import PinholeLens, RadialLens, RisingCurve
 from lidarpainter_models.serving.messages import read_request
-from lidarpainter_models.serving.sensor_cameras import PinholeLens, RadialLens, RisingCurve
 
 SIZE, QUICK_SIZE = (480, 270), (96, 54)
 NUM_GAUSSIANS, QUICK_GAUSSIANS = 60_000, 2000

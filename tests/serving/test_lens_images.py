@@ -11,14 +11,14 @@ from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
 from lidarpainter_models.serving.lens_images import DENSITY, LensImage, reading_times
-from lidarpainter_models.serving.messages import pose_message, read_request
-from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
-from lidarpainter_models.serving.sensor_cameras import (
+from lidarpainter_models.serving.lens_models import (
     PinholeLens,
     RadialLens,
     RisingCurve,
     SensorCamera,
 )
+from lidarpainter_models.serving.messages import pose_message, read_request
+from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
 
 WIDTH_PX, HEIGHT_PX = 160, 90
 HALF_RAD = math.radians(95)

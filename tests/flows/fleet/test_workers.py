@@ -26,7 +26,7 @@ from catalog.leases import FolderObjects, Leases
 from catalog.retries import Ending
 from catalog.store import open_store
 from flows.fleet.asked import Asked, wishes
-from flows.fleet.causes import cause_of
+from flows.fleet.error_causes import cause_of
 from flows.fleet.limits import admits
 from flows.fleet.manifest import Budget, read_manifest
 from flows.fleet.planner import Prediction

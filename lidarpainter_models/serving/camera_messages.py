@@ -3,15 +3,15 @@
 import math
 from collections.abc import Sequence
 
-from lidarpainter_models.serving.protos import Message, sensorsim_pb2
-from lidarpainter_models.serving.refusals import invalid
-from lidarpainter_models.serving.sensor_cameras import (
+from lidarpainter_models.serving.lens_models import (
     PinholeLens,
     RadialLens,
     RisingCurve,
     SensorCamera,
     Windshield,
 )
+from lidarpainter_models.serving.protos import Message, sensorsim_pb2
+from lidarpainter_models.serving.refusals import invalid
 
 MOST_SIDE_PX = 8192
 MOST_PIXELS = 2**23

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpainter_models.serving.sensor_cameras import (
+from lidarpainter_models.serving.lens_models import (
     PinholeLens,
     RadialLens,
     RisingCurve,
