@@ -44,6 +44,8 @@ class ViewParameters(BaseModel):
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
     lpips: LpipsFiles = LpipsFiles()
     """Weights for LPIPS; without both files it is null, with the reason."""
+    inception: Path | None = None
+    """Inception's weights for FID and KID; without them both are null, with the reason."""
 
     @property
     def evaluation_config(self) -> EvaluationConfig:
@@ -54,6 +56,7 @@ class ViewParameters(BaseModel):
             conditions=self.conditions,
             feature_weights=self.feature_weights,
             lpips=self.lpips,
+            inception=self.inception,
         )
 
     @property

@@ -120,7 +120,7 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
         require_recorded_width(width_px, run.views.train, "observation.width_px")
     run.painter.load(run.device)
-    load_distances(parameters.feature_weights, parameters.lpips)
+    load_distances(parameters.feature_weights, parameters.lpips, inception=parameters.inception)
     missing = parameters.lpips.missing
     if missing and (parameters.fit.weighs_perceptual or parameters.refine.weighs_perceptual):
         raise ConfigError(f"a fit weighs a perceptual distance: {missing}")

@@ -24,7 +24,7 @@ STRIP_FIGURES = {
 }
 NEURAD, MARKINGS = "neurad", "markings"
 PROTOCOLS = ("paper", "truth", NEURAD, CROSS_CAMERA, MARKINGS, FLICKER, LIDAR)
-WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
+WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads", "--inception")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
 
@@ -41,6 +41,8 @@ painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a mo
 lpips_backbone: File with torchvision's weights of VGG-16, AlexNet or SqueezeNet, for LPIPS; it is
   left out if absent.
 lpips_heads: File with the LPIPS heads (version 0.1) of the same network.
+inception: File with the weights of Inception, for FID and KID, as pytorch-fid publishes it:
+  pt_inception-2015-12-05-6726825d.pth; they are left out if absent.
 all_views: Score every held-out view in place of a sample of them.
 previous: With --protocol flicker: also score painting that uses the image painted before: mixed
   (into what the next one is painted from), shown (to the painter), or both with a comma between.
@@ -56,6 +58,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     feature_weights: Path | None = None,
     lpips_backbone: Path | None = None,
     lpips_heads: Path | None = None,
+    inception: Path | None = None,
     all_views: bool = False,
     previous: str | None = None,
     as_json: AsJson = False,
@@ -64,7 +67,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
 
     Example: lidarpainter evaluate latest --protocol flicker --previous mixed
     """
-    weights = (feature_weights, lpips_backbone, lpips_heads)
+    weights = (feature_weights, lpips_backbone, lpips_heads, inception)
     _check(protocol, previous, weights, all_views=all_views)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
@@ -130,11 +133,15 @@ def _check(
         refuse_unused(f"--protocol {protocol}", {"--all-views": all_views, **given})
 
 
-def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -> dict[str, Any]:
+def _weights(
+    features: Path | None, backbone: Path | None, heads: Path | None, inception: Path | None
+) -> dict[str, Any]:
     """The weights that are given; the run's own stay otherwise."""
     from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
     changes: dict[str, Any] = {} if features is None else {"feature_weights": features}
+    if inception is not None:
+        changes["inception"] = inception
     if backbone is not None or heads is not None:
         changes["lpips"] = LpipsFiles(backbone=backbone, heads=heads)
     return changes

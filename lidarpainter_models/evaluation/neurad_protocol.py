@@ -3,8 +3,10 @@
 So the results on PandaSet of NeuRAD (Tonderski et al., 2024) and its followers are made: every
 held-out image of the split `linspace`, rendered from its recorded pose, compared as a whole (the
 back camera of PandaSet without the rows that show the recording car); PSNR, SSIM and LPIPS are
-means over images. What makes a figure unlike a published one stands beside it: how large the images
-were, how many there were, and why a distance is absent.
+means over images. FID compares the held-out images with renders at the same poses and with renders
+2 and 3 m aside and 1 m up (neurad-studio takes one side of each sequence; here stand both). What
+makes a figure unlike a published one stands beside it: how large the images were, how many there
+were, and why a distance is absent.
 """
 
 from collections.abc import Callable
@@ -13,15 +15,31 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.evaluation.fid_scores import fid_scores, shown_images
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.scene_evaluation import NO_INCEPTION
 from lidarpainter_models.evaluation.score_tables import NEURAD, Scores
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.view_scores import ScoredView, score_views
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
+from lidarpainter_models.scenes.records import RecordedView
 
 SPLIT = "linspace"
 """Half of the frames at even steps; the rest is judged."""
+SHIFTS = (
+    Shift(),
+    Shift(lateral_m=2.0),
+    Shift(lateral_m=-2.0),
+    Shift(lateral_m=3.0),
+    Shift(lateral_m=-3.0),
+    Shift(up_m=1.0),
+)
+"""Where FID is computed."""
 FIGURES = ("psnr", "ssim", "lpips", "lpips_reason", "num_views")
 CUT_ROWS = {("pandaset", "back_camera"): 260 / 1080}
 """Part of the rows at the bottom of a camera's images that is cut off, by data set and camera."""
@@ -37,11 +55,17 @@ def neurad_scores(
 
     Returns:
         Under `neurad`: by camera, and under `all` over every image, `psnr` (dB), `ssim`, `lpips`
-        and its `lpips_reason` where it is absent, `fid` and `kid` (always absent, with their
-        reasons), `num_views`, and the `num_columns` of the images.
+        and its `lpips_reason` where it is absent, `num_views`, and the `num_columns` of the images.
+        Under `all` also `fid` and `kid` at the recorded poses, and the same under the name of each
+        shift; absent with a reason.
     """
     views = held_out.recorded_views(shown.scene, "recorded")
-    renders = count(1)
+    renders, num_renders = count(1), len(views)
+    num_renders *= 1 if distances.inception is None else 1 + len(SHIFTS)
+
+    def told() -> None:
+        progress(next(renders), num_renders)
+
     found: dict[str, dict[str, Any]] = {}
     cameras = [view.camera_name for view in held_out.test_views]
     for name in dict.fromkeys(cameras):
@@ -56,11 +80,45 @@ def neurad_scores(
             own,
             distances=distances,
             device=shown.scene.device,
-            told=lambda: progress(next(renders), len(views)),
+            told=told,
         )
         found[name] = {each: getattr(scores, each) for each in FIGURES}
         found[name]["num_columns"] = own[0].camera.width_px
-    return {NEURAD: {**found, "all": _over_all(list(found.values()))}}
+    likeness = _likeness(held_out, shown, distances, told)
+    found["all"] = {**_over_all(list(found.values())), **likeness.pop(Shift().name)}
+    return {NEURAD: {**found, **likeness}}
+
+
+def _likeness(
+    held_out: HeldOut,
+    shown: ShownScene,
+    distances: PerceptualDistances,
+    told: Callable[[], None],
+) -> dict[str, dict[str, Any]]:
+    """FID and KID at each shift, against the held-out images, all without the rows cut off."""
+    scene = held_out.scene
+    views = [] if distances.inception is None else held_out.test_views
+    directions = road_directions(scene.world_from_ego)
+
+    def kept(
+        image: Float[Tensor, "height width 3"], view: RecordedView
+    ) -> Float[Tensor, "_height width 3"]:
+        cut = CUT_ROWS.get((scene.dataset, view.camera_name), 0.0)
+        return image[: round(len(image) * (1 - cut))]
+
+    def moved(view: RecordedView, shift: Shift) -> Camera:
+        camera = held_out.camera_of(shown.scene, view, "recorded")
+        direction = directions[scene.frame_position(view.frame_index)]
+        return camera.at(shift_pose(camera.world_from_camera, direction, shift))
+
+    beside = {
+        shift.name: map(
+            kept, shown_images(shown, [(view, moved(view, shift)) for view in views], told), views
+        )
+        for shift in SHIFTS
+    }
+    real = map(kept, map(held_out.image_of, views), views)
+    return fid_scores(distances.inception, real, beside)
 
 
 def cropped(view: ScoredView, cut_share: float) -> ScoredView:
@@ -72,7 +130,7 @@ def cropped(view: ScoredView, cut_share: float) -> ScoredView:
 
 
 def _over_all(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """The mean over every image of all cameras, and why two distances are absent."""
+    """The mean over every image of all cameras."""
     weigh = partial(_weighed, parts)
     return {
         "psnr": weigh("psnr"),
@@ -81,10 +139,6 @@ def _over_all(parts: list[dict[str, Any]]) -> dict[str, Any]:
         "lpips_reason": parts[0]["lpips_reason"],
         "num_views": sum(part["num_views"] for part in parts),
         "num_columns": parts[0]["num_columns"],
-        "fid": None,
-        "fid_reason": NO_INCEPTION,
-        "kid": None,
-        "kid_reason": NO_INCEPTION,
     }
 
 

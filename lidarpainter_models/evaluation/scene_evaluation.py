@@ -13,6 +13,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.evaluation.fid_scores import fid_scores, shown_images
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
@@ -27,12 +28,12 @@ from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
 NO_IMAGES = "nobody took images there"
-NO_INCEPTION = "this version has no Inception network and computes neither FID nor KID"
 Scored = Callable[[Sequence[ScoredView]], ViewScores | None]
 """Renders views as the judged scene is shown and scores them."""
 
@@ -46,15 +47,17 @@ class SceneEvaluation:
 
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> Scores:
         """Recorded views, views beside the path, and depth at both, over a sample of the views."""
-        shifts = self.config.scoring.shifts
-        held_out = self.held_out.sampled(self.config.scoring.most_views)
+        config = self.config
+        shifts = config.scoring.shifts
+        held_out = self.held_out.sampled(config.scoring.most_views)
         distances = load_distances(
-            self.config.feature_weights, self.config.lpips, shown.scene.device
+            config.feature_weights, config.lpips, shown.scene.device, inception=config.inception
         )
         cameras = tuple(dict.fromkeys(view.camera_name for view in held_out.test_views))
         num_views, is_known = len(held_out.test_views), known_street(held_out.scene)
         # each view at both poses, where truth is known at every shift, and everywhere for depth
         times = 2 + (len(shifts) if is_known else 0) + 1 + len(shifts)
+        times += 0 if distances.inception is None else len(shifts)
         renders = itertools.count(1)
 
         def told() -> None:
@@ -66,12 +69,41 @@ class SceneEvaluation:
             shift.name: _mean([novel[shift.name] for _recorded, novel in parts.values()])
             for shift in shifts
         }
+        for name, found in self._likeness(shown, held_out, distances, told).items():
+            novel[name] |= found
         fractions = score_geometry(held_out, shown.scene, shifts, told=told)
         for name, fraction in fractions.items():
             novel.get(name, recorded)[DEPTH] = fraction
         recorded["num_held_out"] = len(self.held_out.test_views)
         by_camera = {name: recorded for name, (recorded, _novel) in parts.items()}
         return {"recorded": recorded, "novel": novel, "recorded_by_camera": by_camera}
+
+    def _likeness(
+        self,
+        shown: ShownScene,
+        held_out: HeldOut,
+        distances: PerceptualDistances,
+        told: Callable[[], None],
+    ) -> dict[str, dict[str, Any]]:
+        """FID and KID beside the path, per trajectory, against all recorded images.
+
+        The paper compares what is rendered beside the path with the recorded video; of both so many
+        images are taken as are judged, evenly over cameras and time.
+        """
+        scene = held_out.scene
+        views = [] if distances.inception is None else held_out.test_views
+        names = {view.camera_name for view in views}
+        recorded = [view for view in scene.views if view.camera_name in names]
+        real = sampled_views(recorded, self.config.scoring.most_views or len(recorded))
+        beside = {
+            shift.name: shown_images(
+                shown,
+                [(view, held_out.shifted_camera(shown.scene, view, shift)) for view in views],
+                told,
+            )
+            for shift in self.config.scoring.shifts
+        }
+        return fid_scores(distances.inception, map(held_out.image_of, real), beside)
 
     def _of_camera(
         self,
@@ -223,7 +255,6 @@ def _pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _unknown(num_views: int) -> dict[str, Any]:
     """The figures of a place where nobody took an image."""
     reasons = dict.fromkeys(("psnr", "ssim", "lpips"), NO_IMAGES)
-    reasons |= dict.fromkeys(("fid", "kid"), NO_INCEPTION)
     return {
         **dict.fromkeys(reasons),
         **{f"{name}_reason": reason for name, reason in reasons.items()},

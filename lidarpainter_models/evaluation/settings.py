@@ -46,9 +46,11 @@ class EvaluationConfig:
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
     lpips: LpipsFiles = field(default_factory=LpipsFiles)
     """Weights for LPIPS; without both files it is left out."""
+    inception: Path | None = None
+    """Inception's weights for FID and KID; None leaves them out."""
 
     @property
     def weight_files(self) -> dict[str, Path]:
         """Files that the perceptual distances depend on, by the part they play."""
-        features = {} if self.feature_weights is None else {"features": self.feature_weights}
-        return features | self.lpips.named
+        files = {"features": self.feature_weights, "inception": self.inception}
+        return {n: path for n, path in files.items() if path is not None} | self.lpips.named

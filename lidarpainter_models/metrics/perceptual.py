@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.metrics.backbones import load_squeezenet_distance
+from lidarpainter_models.metrics.inception import Inception, load_inception
 from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
@@ -27,10 +28,16 @@ class PerceptualDistances:
     lpips: ImageDistance | None = None
     lpips_missing: str | None = LpipsFiles().missing
     """Why there is no LPIPS; None where there is."""
+    inception: Inception | None = None
+    """The network of FID and KID."""
 
 
 def load_distances(
-    feature_weights: Path | None, lpips: LpipsFiles, device: torch.device | None = None
+    feature_weights: Path | None,
+    lpips: LpipsFiles,
+    device: torch.device | None = None,
+    *,
+    inception: Path | None = None,
 ) -> PerceptualDistances:
     """Load every distance whose weights are named, to a device.
 
@@ -41,5 +48,8 @@ def load_distances(
     if feature_weights is not None:
         features = load_squeezenet_distance(feature_weights).to(device)
     return PerceptualDistances(
-        features=features, lpips=load_lpips(lpips, device), lpips_missing=lpips.missing
+        features=features,
+        lpips=load_lpips(lpips, device),
+        lpips_missing=lpips.missing,
+        inception=None if inception is None else load_inception(inception, device),
     )

@@ -235,7 +235,9 @@ def _build_neurad(
     shown: Callable[[], ShownScene],
 ) -> dict[str, Any]:
     scene = shown()
-    distances = load_distances(config.feature_weights, config.lpips, scene.scene.device)
+    distances = load_distances(
+        config.feature_weights, config.lpips, scene.scene.device, inception=config.inception
+    )
     scores = neurad_scores(held_out, scene, distances, progress)
     write_json(place.output / SCORES_FILE, scores)
     return {name: scores[NEURAD]["all"][name] for name in ("psnr", "num_views")}

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from gaussian_world import scene_trained_on
+from stub_inception import MeansAsFeatures
 from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
@@ -27,7 +28,7 @@ def held_out():
     return HeldOut(scene=street, test_views=tests, observation=ObservationConfig(width_px=WIDTH_PX))
 
 
-def scores(held_out, wrong_rows):
+def scores(held_out, wrong_rows, distances=None):
     """Of images that are exact but for so many rows at the bottom."""
     views = held_out.scene.views
     fitted = scene_trained_on([view for view in views if view.frame_index % 2 == 0])
@@ -46,7 +47,7 @@ def scores(held_out, wrong_rows):
 
             return render
 
-    return neurad_scores(held_out, Shown(scene=fitted), PerceptualDistances(), told)
+    return neurad_scores(held_out, Shown(scene=fitted), distances or PerceptualDistances(), told)
 
 
 def told(_done, _total):
@@ -84,5 +85,24 @@ def test_what_is_absent_says_why(held_out):
         for protocol, camera, name, value, reason in rows
         if value is None
     }
-    assert reasons[NEURAD, "all", "fid"]
+    assert "Inception" in reasons[NEURAD, "all", "fid"]
+    assert "Inception" in reasons[NEURAD, "right-3m", "kid"]
     assert reasons[NEURAD, "all", "lpips"]
+
+
+def test_fid_compares_what_is_left_of_images_at_every_shift(held_out):
+    """What is cut off counts in no set; images of the toy street are the same wherever it is."""
+    height_px = held_out.image_of(held_out.test_views[0]).shape[0]
+    cut = height_px - round(height_px * (1 - 260 / 1080))
+    back = HeldOut(
+        scene=held_out.scene,
+        test_views=[view for view in held_out.test_views if view.camera_name == "back_camera"],
+        observation=held_out.observation,
+    )
+    network = PerceptualDistances(inception=MeansAsFeatures())
+    exact = scores(back, wrong_rows=cut, distances=network)[NEURAD]
+    wrong = scores(back, wrong_rows=cut + 4, distances=network)[NEURAD]
+    for name in ("all", "left-2m", "right-2m", "left-3m", "right-3m", "up-1m"):
+        assert exact[name]["fid"] == pytest.approx(0, abs=1e-9)
+        assert wrong[name]["fid"] > 1e-4
+        assert (exact[name]["num_real"], exact[name]["num_shown"]) == (2, 2)

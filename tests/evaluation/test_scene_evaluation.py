@@ -6,9 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from gaussian_world import scene_trained_on
+from stub_inception import MeansAsFeatures
 from toy_street import ToyStreet, world_from_car
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.evaluation import scene_evaluation
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation, _mean
 from lidarpainter_models.evaluation.settings import EvaluationConfig, ScoringConfig
@@ -28,9 +30,8 @@ FRONT, SIDE = "front", "side"
 JUDGED_FRAMES = (1, 2)
 
 
-@pytest.fixture(scope="module")
-def judged():
-    """Of a scene that holds nothing of the street, by a bright and a dark camera; with progress."""
+def judge():
+    """Scores of a scene that holds nothing of the street, by two cameras, and their progress."""
     street = ToyStreet(4, ((FRONT, 1.0), (SIDE, 0.5)))
     street.manifest = {}
     tests = tuple(view for view in street.views if view.frame_index in JUDGED_FRAMES)
@@ -48,6 +49,12 @@ def judged():
 
 
 @pytest.fixture(scope="module")
+def judged():
+    """With no weights of any distance."""
+    return judge()
+
+
+@pytest.fixture(scope="module")
 def scores(judged):
     return judged[0]
 
@@ -55,6 +62,21 @@ def scores(judged):
 def test_every_render_is_told(judged):
     # four views, at both poses and, for depth, there and beside the path
     assert judged[1] == [(done, 4 * 4) for done in range(1, 4 * 4 + 1)]
+
+
+def test_with_the_network_images_beside_the_path_are_held_against_recorded_ones(
+    scores, monkeypatch
+):
+    assert scores["novel"]["left-1m"]["fid"] is None
+    assert "Inception" in scores["novel"]["left-1m"]["fid_reason"]
+    network = PerceptualDistances(inception=MeansAsFeatures())
+    monkeypatch.setattr(scene_evaluation, "load_distances", lambda *_files, **_more: network)
+    likened, told = judge()
+    assert told == [(done, 4 * 5) for done in range(1, 4 * 5 + 1)]
+    beside = likened["novel"]["left-1m"]
+    assert beside["fid"] > 0.01
+    assert (beside["num_real"], beside["num_shown"]) == (8, 4)
+    assert beside["kid"] is not None
 
 
 def test_views_of_all_cameras_have_their_score(scores):
