@@ -6,6 +6,7 @@ Every one has a seed of its own, so that no street of a stress sweep or a calibr
 What is there as asked for stays.
 """
 
+import argparse
 import sys
 from dataclasses import replace
 from math import radians
@@ -85,4 +86,6 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("store", help="where the streets are written")
+    main(parser.parse_args().store)
