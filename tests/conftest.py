@@ -7,7 +7,10 @@ Without a GPU, Triton's kernels run in its interpreter.
 
 import os
 import re
+import shutil
+import tempfile
 from collections.abc import Iterator
+from functools import lru_cache, partial
 from importlib import import_module
 from pathlib import Path
 
@@ -25,6 +28,8 @@ if not import_module("torch").cuda.is_available():  # not before the threads are
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_ENVIRONMENT = "LIDARPAINTER_SHARED"
+FOLDER = "LIDARPAINTER_DRAWN_STREETS"
+"""Where the streets lie that tests have drawn (`drawn_streets`)."""
 
 settings.register_profile("shared machine", deadline=None)  # time says nothing on a busy core
 settings.load_profile("shared machine")
@@ -56,6 +61,23 @@ def shared_folder() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip(f"no real data at {folder} (set {SHARED_ENVIRONMENT})")
     return folder
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the folder of drawn streets, for this process and those it starts."""
+    if FOLDER not in os.environ:
+        os.environ[FOLDER] = tempfile.mkdtemp(prefix="drawn-streets-")
+        config.add_cleanup(partial(shutil.rmtree, os.environ[FOLDER]))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _streets_drawn_once() -> None:
+    """Read a street that any process of this test run has drawn."""
+    from drawn_streets import kept_city
+
+    from lidarpainter_models.synthetic import street
+
+    street._city = lru_cache(maxsize=2)(kept_city)
 
 
 @pytest.fixture(autouse=True)

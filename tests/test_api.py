@@ -7,14 +7,12 @@ import sys
 from pathlib import Path
 
 import cv2
-from drawn_streets import drawn_street
 
 import lidarpainter_models as lp
 from catalog.code_closure import SourceTree
 from lidarpainter_models import api
-from lidarpainter_models.evaluation import scene_evaluation
 from lidarpainter_models.metrics.images import psnr_from_error
-from lidarpainter_models.synthetic import sequence
+from lidarpainter_models.synthetic import SyntheticStreet
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_MS = 50.0
@@ -58,11 +56,6 @@ def test_no_stage_reaches_the_public_names():
 
 
 def test_example_of_the_readme_ends_with_an_image(tmp_path, monkeypatch, capsys):
-    # the same street, drawn once for all tests of the process
-    monkeypatch.setattr(sequence, "SyntheticStreet", drawn_street)
-    monkeypatch.setattr(
-        scene_evaluation, "known_street", lambda scene: drawn_street(street_of(scene.manifest))
-    )
     monkeypatch.chdir(tmp_path)
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
     assert len(example.splitlines()) < 30
@@ -72,7 +65,7 @@ def test_example_of_the_readme_ends_with_an_image(tmp_path, monkeypatch, capsys)
     image = cv2.imread(str(tmp_path / "lidarpainter-example" / "aside.png"))
     assert image.shape == (180, 640, 3)
     aside, time_ns = names["aside"], names["view"].timestamp_ns
-    truth = drawn_street(street_of(names["scene"].manifest)).render(aside, time_ns).rgb
+    truth = SyntheticStreet(street_of(names["scene"].manifest)).render(aside, time_ns).rgb
     render_db, painted_db = (
         psnr_from_error(float((names[name].rgb - truth).square().mean()))
         for name in ("render", "painted")

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.calibration import CameraTurn, check_calibration, why_untold
 from lidarpainter_models.checks.depth_edges import SceneEdges
@@ -15,7 +14,7 @@ from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.lidar.spatiotemporal_calibration import images_agree
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig, record_street
 
 PITCH, YAW, ROLL = 0, 1, 2
 
@@ -23,7 +22,7 @@ PITCH, YAW, ROLL = 0, 1, 2
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     config = SyntheticStreetConfig(seed=7, num_frames=4, width_px=320, height_px=180)
-    return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
+    return record_street(SyntheticStreet(config), tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="module")

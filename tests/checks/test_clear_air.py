@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.sweeps import check_clear_air
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 
@@ -22,7 +21,7 @@ def test_rain_is_named_and_dry_air_is_not(tmp_path, share, verdict_then, says):
     config = SyntheticStreetConfig(
         seed=7, num_frames=3, width_px=64, height_px=36, cameras=DEFAULT_CAMERAS[:1]
     )
-    scene = DrivingScene.open(record_street(drawn_street(config), tmp_path))
+    scene = DrivingScene.open(record_street(SyntheticStreet(config), tmp_path))
     verdict, detail = check_clear_air(scene)
     assert verdict == "ok"
     assert detail.endswith("of the returns 3 to 40 m away stand alone")

@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.actors import check_box_points
 from lidarpainter_models.checks.doctor import check_scene
@@ -15,7 +14,12 @@ from lidarpainter_models.checks.sweeps import LidarReach, check_coverage
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 HALF_SECTOR_DEG = 60.0
@@ -27,7 +31,7 @@ def street(tmp_path_factory):
     config = SyntheticStreetConfig(
         seed=7, num_frames=4, width_px=320, height_px=180, cameras=(DEFAULT_CAMERAS[0], rear)
     )
-    return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
+    return record_street(SyntheticStreet(config), tmp_path_factory.mktemp("street"))
 
 
 def is_ahead(sweep, xyz_m):

@@ -1,7 +1,6 @@
 """A fit in plain torch on the CPU, which is what a GPU runs, is the fit of numba."""
 
 import pytest
-from drawn_streets import drawn_street
 
 from lidarpainter_models.gaussians.fitting.config import (
     DensificationConfig,
@@ -16,7 +15,7 @@ from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 STEPS = 100
@@ -35,7 +34,7 @@ def street(tmp_path_factory):
     config = SyntheticStreetConfig(
         seed=1, num_frames=12, width_px=160, height_px=90, cameras=DEFAULT_CAMERAS[:1]
     )
-    scene = DrivingScene.open(record_street(drawn_street(config), folder))
+    scene = DrivingScene.open(record_street(SyntheticStreet(config), folder))
     split = split_views(scene, "alternate", None)
     observations = prepare_observations(scene, split, ObservationConfig(width_px=160))
     return observations, initialise_scene(observations, CONFIG.initialisation)

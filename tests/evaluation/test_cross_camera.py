@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from drawn_streets import drawn_street
 from gaussian_world import scene_trained_on
 from tiny_street import FRONT, NUM_FRAMES, SIDE, SIDE_GAIN, tiny_street
 
@@ -25,7 +24,7 @@ from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tan
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.synthetic import RigCamera, record_street
+from lidarpainter_models.synthetic import RigCamera, SyntheticStreet, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 WIDTH_PX = 160
@@ -37,7 +36,7 @@ FIT_FRAMES, JUDGED_FRAMES = (0, 2, 4), (1, 3, 5)
 @pytest.fixture(scope="module")
 def street():
     exact = {"sensor_noise": 0.0, "jpeg_quality": 100, "samples_per_axis": 2}
-    return drawn_street(tiny_street(width_px=WIDTH_PX, height_px=90, **exact))
+    return SyntheticStreet(tiny_street(width_px=WIDTH_PX, height_px=90, **exact))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +110,7 @@ def test_a_camera_judges_beside_the_fitted_one_that_sees_most_of_what_it_does(tm
     left = RigCamera(name="left_camera", focal_per_width=0.8, yaw_rad=1.0)
     right = RigCamera(name=SIDE, focal_per_width=0.8, yaw_rad=-0.35)
     rig = tiny_street(cameras=(back, left, DEFAULT_CAMERAS[0], right))
-    scene = DrivingScene.open(record_street(drawn_street(rig), tmp_path))
+    scene = DrivingScene.open(record_street(SyntheticStreet(rig), tmp_path))
     seen = split_views(scene, "alternate", ("back_camera", "left_camera", FRONT))
     held_out = HeldOut(
         scene=scene, test_views=seen.test, observation=ObservationConfig(width_px=96)

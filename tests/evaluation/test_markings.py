@@ -5,7 +5,6 @@ import copy
 import numpy as np
 import pytest
 import torch
-from drawn_streets import drawn_street
 from gaussian_world import scene_trained_on
 
 from lidarpainter_models.errors import ConfigError
@@ -16,6 +15,7 @@ from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import SyntheticStreet
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from lidarpainter_models.synthetic.sequence import record_street
 
@@ -28,7 +28,7 @@ LEFT = Shift(lateral_m=2.0)
 def street():
     cameras = tuple(one for one in DEFAULT_CAMERAS if one.name in ("front_camera", SIDE))
     size = {"width_px": WIDTH_PX, "height_px": 200}
-    return drawn_street(SyntheticStreetConfig(seed=7, num_frames=3, cameras=cameras, **size))
+    return SyntheticStreet(SyntheticStreetConfig(seed=7, num_frames=3, cameras=cameras, **size))
 
 
 @pytest.fixture(scope="module")

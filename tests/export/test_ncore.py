@@ -11,7 +11,6 @@ import pytest
 import torch
 from av2_log import CAMERAS
 from commands import refuse, succeed
-from drawn_streets import drawn_street
 from ncore.data import FrameTimepoint, ShutterType
 from ncore.data.v4 import SequenceComponentGroupsReader, SequenceLoaderV4
 from nuscenes_log import FAR_AWAY
@@ -23,7 +22,12 @@ from lidarpainter_models.geometry.transforms import invert_rigid, transform_poin
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Distortion
-from lidarpainter_models.synthetic import RigLidar, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 SHARED = os.environ.get("LIDARPAINTER_SHARED")
 NAME = "synthetic_street-0005"
@@ -49,7 +53,7 @@ def street(tmp_path_factory):
         cameras=CAMERAS,
         lidar=RigLidar(name="pandar64", columns=360),
     )
-    path = record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
+    path = record_street(SyntheticStreet(config), tmp_path_factory.mktemp("street"))
     scene = DrivingScene.open(path)
     scene.manifest["global_from_world"] = FAR_AWAY.reshape(16).tolist()
     return scene

@@ -10,7 +10,6 @@ from html.parser import HTMLParser
 import pytest
 import torch
 from chromium import found_browser
-from drawn_streets import drawn_street
 from tiny_street import tiny_street
 from toy_street import ToyStreet
 
@@ -27,7 +26,7 @@ from lidarpainter_models.export.report import (
 )
 from lidarpainter_models.export.run_page import Pictures, RunPage
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import record_street
+from lidarpainter_models.synthetic import SyntheticStreet, record_street
 
 WIDTHS_PX = (1400, 400)
 INPUTS = ("LiDAR", "warped recording", "painted at view time", "confidence")
@@ -165,7 +164,7 @@ def test_many_settings_are_folded_up_and_few_facts_are_not():
 
 
 def test_page_begins_with_what_the_scene_is(tmp_path):
-    scene = DrivingScene.open(record_street(drawn_street(tiny_street()), tmp_path))
+    scene = DrivingScene.open(record_street(SyntheticStreet(tiny_street()), tmp_path))
     report = run_page(scene, **judged())
     assert report.summary[0].startswith(
         "Sequence street-0005 of the dataset synthetic: 6 frames in 0.5 s; 12 images of 2 cameras "

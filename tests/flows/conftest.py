@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,19 +46,8 @@ def prefect_api(tmp_path_factory):
 
 
 @pytest.fixture(scope="package")
-def drawn_once():
-    """A street is all in its seed, and drawing it takes seconds: no seed is drawn twice."""
-    from lidarpainter_models.synthetic import street
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(street, "build_city", cache(street.build_city))
-        yield
-
-
-@pytest.fixture(scope="package")
 def tiny_run(
     prefect_api: None,  # noqa: ARG001 - flows find it where Prefect looks
-    drawn_once: None,  # noqa: ARG001
     tmp_path_factory: pytest.TempPathFactory,
 ) -> TinyRun:
     """The demo on a tiny street: ingested, fitted, painted, fitted on, judged, reported."""

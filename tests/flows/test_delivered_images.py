@@ -33,7 +33,7 @@ CHANGES = (f"observation.width_px={WIDTH_PX}", "rounds=0", "fit.steps=120")
 
 
 @pytest.fixture(scope="module")
-def stereo_run(prefect_api, drawn_once, tmp_path_factory):  # noqa: ARG001
+def stereo_run(prefect_api, tmp_path_factory):  # noqa: ARG001
     store = open_store(tmp_path_factory.mktemp("stereo") / "store")
     street = tiny_street(seed=6, width_px=WIDTH_PX, height_px=108, cameras=CAMERAS)
     ingest_street.fn(store.root, street)

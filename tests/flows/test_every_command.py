@@ -10,8 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refuse, seen_image, succeed
-from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SIDE, TINY, WIDTH_PX, reconstructed
+from tiny_street import (
+    FRONT,
+    HEIGHT_PX,
+    NUM_FRAMES,
+    QUICK_LIDAR,
+    SCENE,
+    SIDE,
+    TINY,
+    WIDTH_PX,
+    reconstructed,
+)
 
+from flows import lidar
 from flows.cli.evaluate import NEURAD, PROTOCOLS
 from lidarpainter_models.export.images import read_image
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
@@ -232,7 +243,8 @@ def test_a_shifted_camera_stands_where_it_was_asked_to(tiny_run, tmp_path):
 
 
 @pytest.mark.parametrize("protocol", [name for name in PROTOCOLS if name != NEURAD])
-def test_evaluate_judges_by_every_protocol_and_only_once(tiny_run, protocol):
+def test_evaluate_judges_by_every_protocol_and_only_once(tiny_run, protocol, monkeypatch):
+    monkeypatch.setattr(lidar, "LidarConfig", QUICK_LIDAR)
     words = ("evaluate", tiny_run.run_id, "--protocol", protocol)
     first, again = (succeed(*words, "--json", store=tiny_run.store) for _ in range(2))
     result = first.json

@@ -1,28 +1,23 @@
 """Simulated sweeps of a run: judged, written, and the sensor of its log."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import refuse, succeed
 from pyarrow import parquet
-from tiny_street import SCENE, reconstructed
+from tiny_street import QUICK_LIDAR, SCENE, reconstructed
 
 from flows import lidar, reconstruct
 from flows.measure.figures import qualities
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
 
-QUICK = partial(
-    LidarConfig, num_surfels=5000, steps=20, rays_per_step=2048, rays_per_sweep=4000, hits=12
-)
 COLUMNS = {"x", "y", "z", "intensity", "ring", "return", "timestamp_ns", "actor"}
 
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
-    monkeypatch.setattr(lidar, "LidarConfig", QUICK)
+    monkeypatch.setattr(lidar, "LidarConfig", QUICK_LIDAR)
 
 
 def test_held_out_sweeps_judge_a_run_and_enter_the_catalog(tiny_run):
@@ -40,7 +35,7 @@ def test_held_out_sweeps_judge_a_run_and_enter_the_catalog(tiny_run):
 
 
 def test_a_run_judges_its_sweeps_at_once_where_that_is_asked_for(tiny_run, monkeypatch):
-    monkeypatch.setattr(reconstruct, "LidarConfig", QUICK)
+    monkeypatch.setattr(reconstruct, "LidarConfig", QUICK_LIDAR)
     result = reconstructed(tiny_run, "--set", "judge_lidar=true", "--json").json
     within = result["lidar"]["own"]["within_10_cm"]
     page = Path(result["report"]).read_text("utf-8")

@@ -2,14 +2,13 @@
 
 import pytest
 from commands import call, refuse, succeed
-from drawn_streets import drawn_street
 from tiny_street import TINY, tiny_street
 
 from catalog.store import open_store
 from lidarpainter_models.lidar.localised import write_without_poses
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.schema import LABELLED, LOCALISED, POSES
-from lidarpainter_models.synthetic import RigLidar
+from lidarpainter_models.synthetic import RigLidar, SyntheticStreet
 from lidarpainter_models.synthetic.sequence import record_street
 from tasks.ingest.ingest import record_scene
 
@@ -22,7 +21,7 @@ def store(tmp_path_factory):
     store = open_store(tmp_path_factory.mktemp("unlabelled") / "store")
     store.make()
     config = tiny_street(12, num_frames=10, lidar=RigLidar(columns=900))
-    path = record_street(drawn_street(config), store.root)
+    path = record_street(SyntheticStreet(config), store.root)
     record_scene(store, path)
     record_scene(store, write_without_poses(DrivingScene.open(path), store.root, "stripped"))
     return store

@@ -3,14 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from drawn_streets import drawn_street
 from pandaset_log import CAMERA_NAMES, far_away_frame, set_boxes_upright, write_pandaset_log
 from scene_differences import scene_differences
 
 from lidarpainter_models.checks.doctor import check_scene
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 YAW_RAD = dict(zip(CAMERA_NAMES, np.radians([0, 57, -57, 90, -90, 180]).tolist(), strict=True))
 
@@ -32,7 +37,7 @@ def scenes(tmp_path_factory):
         cameras=cameras,
         lidar=RigLidar(columns=600),
     )
-    truth = DrivingScene.open(record_street(drawn_street(config), folder / "truth"))
+    truth = DrivingScene.open(record_street(SyntheticStreet(config), folder / "truth"))
     set_boxes_upright(truth)
     truth.manifest["global_from_world"] = far_away_frame().reshape(16).tolist()
     write_pandaset_log(truth, folder / "log")

@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 import torch
-from drawn_streets import drawn_street
 from nuscenes_log import FAR_AWAY
 
 from lidarpainter_models.geometry.timed_poses import poses_at
@@ -23,7 +22,13 @@ from lidarpainter_models.geometry.transforms import (
     transform_points,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 LOG = "00a6ffc1-6ce9-3bc3-a060-6006e9893a1a"
 CAMERAS = (
@@ -44,7 +49,7 @@ def street_like_av2(store, **settings):
         "lidar": RigLidar(beams=64, columns=360),
     } | settings
     config = SyntheticStreetConfig(cameras=CAMERAS, **chosen)
-    scene = DrivingScene.open(record_street(drawn_street(config), store))
+    scene = DrivingScene.open(record_street(SyntheticStreet(config), store))
     scene.manifest["global_from_world"] = FAR_AWAY.reshape(16).tolist()
     return scene
 

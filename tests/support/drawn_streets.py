@@ -1,22 +1,27 @@
-"""Synthetic streets for all tests of a process: drawing one takes seconds; its seed is all of it.
+"""Each synthetic street is drawn once for all processes of a test run: drawing one takes seconds.
 
-street = drawn_street(SyntheticStreetConfig(seed=5, num_frames=3))
-path = record_street(street, folder)
+A street is all in the settings of its world, so what one process has drawn the others read from a
+file. `conftest` makes their folder and puts `kept_city` where streets are drawn.
 """
 
-import copy
-from functools import cache
+import fcntl
+import hashlib
+import json
+import os
+import pickle
+from pathlib import Path
 
-from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig
-
-
-def drawn_street(config):
-    """The street of a config's seed, drawn once, seen with the config's sensors."""
-    street = copy.copy(_first_drawn(config.seed))
-    street.config = config
-    return street
+from lidarpainter_models.synthetic.world.city import build_city
 
 
-@cache
-def _first_drawn(seed):
-    return SyntheticStreet(SyntheticStreetConfig(seed=seed))
+def kept_city(**world):
+    """`build_city`, or what it gave in this test run."""
+    name = hashlib.sha256(json.dumps(world, sort_keys=True).encode()).hexdigest()[:16]
+    path = Path(os.environ["LIDARPAINTER_DRAWN_STREETS"]) / f"{name}.pickle"
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.exists():
+            return pickle.loads(path.read_bytes())  # noqa: S301 - our own file
+        city = build_city(**world)
+        path.write_bytes(pickle.dumps(city, protocol=pickle.HIGHEST_PROTOCOL))
+        return city

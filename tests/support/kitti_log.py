@@ -104,44 +104,54 @@ class _Drive:
 
     def boxes(self, position):
         """Number and track of each box, and its pose when the LiDAR looked at it, in its frame."""
-        frame_index = self.scene.frame_indices[position]
+        there = list(self._boxes_in(self.scene.frame_indices[position]))
+        if not there:
+            return
+        poses = torch.stack([pose for _number, _track, pose in there])
+        _, times_ns, _ = self._seen(poses[:, :3, 3].numpy(), position)
+        in_lidar = invert_rigid(self.world_at(times_ns)) @ poses
+        for (number, track, _pose), pose in zip(there, in_lidar, strict=True):
+            yield number, track, pose
+
+    def _boxes_in(self, frame_index):
+        """Number, track and world pose of each box of a frame."""
         for number, track in enumerate(self.scene.tracks):
             for row in (track.frame_indices == frame_index).nonzero()[:, 0].tolist():
-                pose = track.world_from_box[row]
-                _, times_ns, _ = self._seen(pose[None, :3, 3].numpy(), position)
-                yield number, track, invert_rigid(self.world_at(times_ns)[0]) @ pose
+                yield number, track, track.world_from_box[row]
 
     def _leave_out_the_seam(self):
-        frames, self.points = self.scene.frame_indices, []
+        frames, self.points, passed = self.scene.frame_indices, [], set()
         for position, frame_index in enumerate(frames):
             points = self.scene.read_points(frame_index)
             found = torch.from_numpy(self._seen(points.xyz_m.double().numpy(), position)[2])
             kept = {name: getattr(points, name)[found] for name in points.__dataclass_fields__}
             self.points.append(type(points)(**kept))
+            there = list(self._boxes_in(frame_index))
+            if there:
+                centres = torch.stack([pose[:3, 3] for _number, _track, pose in there]).numpy()
+                is_seen = self._seen(centres, position)[2]
+                passed |= {one[0] for one, seen in zip(there, is_seen, strict=True) if not seen}
         self.scene.read_points = lambda frame: self.points[frames.index(frame)]
         self.scene.tracks = tuple(
-            track
-            for track in self.scene.tracks
-            if all(
-                self._seen(pose[None, :3, 3].numpy(), frames.index(frame))[2].all()
-                for frame, pose in zip(
-                    track.frame_indices.tolist(), track.world_from_box, strict=True
-                )
-            )
+            track for number, track in enumerate(self.scene.tracks) if number not in passed
         )
 
     def _seen(self, xyz_world_m, position):
         """Places in the LiDAR's frame, when it looked at them, and whether it did in this turn."""
         times_ns = np.full(len(xyz_world_m), self.times_ns[position])
-        moved_ns = times_ns
+        moved_ns, seen_m = np.zeros_like(times_ns), np.empty((len(xyz_world_m), 3))
+        rows = np.arange(len(xyz_world_m))  # those whose time has not settled
         for _ in range(12):
-            lidar_from_world = invert_rigid(self.world_at(times_ns)).numpy()
-            seen_m = np.einsum("nij,nj->ni", lidar_from_world[:, :3, :3], xyz_world_m)
-            seen_m += lidar_from_world[:, :3, 3]
-            share = 0.5 - np.arctan2(seen_m[:, 1], seen_m[:, 0]) / (2 * np.pi)
+            lidar_from_world = invert_rigid(self.world_at(times_ns[rows])).numpy()
+            seen_m[rows] = np.einsum("nij,nj->ni", lidar_from_world[:, :3, :3], xyz_world_m[rows])
+            seen_m[rows] += lidar_from_world[:, :3, 3]
+            share = 0.5 - np.arctan2(seen_m[rows, 1], seen_m[rows, 0]) / (2 * np.pi)
             offset_ns = np.rint((share - 0.5) * PERIOD_NS).astype(np.int64)
-            moved_ns = times_ns - (self.times_ns[position] + offset_ns)
-            times_ns = self.times_ns[position] + offset_ns
+            moved_ns[rows] = times_ns[rows] - (self.times_ns[position] + offset_ns)
+            times_ns[rows] = self.times_ns[position] + offset_ns
+            rows = rows[moved_ns[rows] != 0]
+            if not len(rows):
+                break
         return seen_m, times_ns, np.abs(moved_ns) < 1000
 
     def write_files(self, position, image, sweep):

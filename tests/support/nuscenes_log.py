@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from drawn_streets import drawn_street
 
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
@@ -29,7 +28,13 @@ from lidarpainter_models.geometry.transforms import (
     transform_points,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 HALF_TURN_US = 25_000
 SCENE_NAME = "scene-0061"
@@ -76,7 +81,7 @@ def street_like_nuscenes(store, *, global_from_world=FAR_AWAY, **settings):
         "lidar": RigLidar(beams=32, columns=360),
     } | settings
     config = SyntheticStreetConfig(frame_interval_s=0.05, cameras=CAMERAS, **chosen)
-    scene = DrivingScene.open(record_street(drawn_street(config), store))
+    scene = DrivingScene.open(record_street(SyntheticStreet(config), store))
     scene.manifest["global_from_world"] = global_from_world.reshape(16).tolist()
     scene.tracks = tuple(_when_seen(track, scene) for track in scene.tracks)
     return scene

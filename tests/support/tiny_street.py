@@ -1,7 +1,10 @@
 """A street so small that every command gets through it in seconds: two cameras that overlap."""
 
+from functools import partial
+
 from commands import settings, succeed
 
+from lidarpainter_models.gaussians.returns.settings import LidarConfig
 from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
@@ -25,6 +28,10 @@ SETTINGS = (
     "refine.densification.budget=2000",
 )
 """The preview preset, shrunk; the side camera is kept to judge by."""
+QUICK_LIDAR = partial(
+    LidarConfig, num_surfels=5000, steps=20, rays_per_step=2048, rays_per_sweep=4000, hits=12
+)
+"""In place of `LidarConfig`: what a LiDAR sees of the street is learnt in a second."""
 TINY = ("--preset", "brief", *settings(*SETTINGS))
 
 

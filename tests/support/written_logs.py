@@ -10,7 +10,6 @@ from pathlib import Path
 
 from av2_log import LOG, street_like_av2, write_av2_log
 from bag_log import write_foxglove_bag, write_ros_bag
-from drawn_streets import drawn_street
 from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
 from ncore_log import SEQUENCE as NCORE_SEQUENCE
 from ncore_log import write_ncore_log
@@ -23,7 +22,13 @@ from waymo_truth import street_config, write_truth
 
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    record_street,
+)
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ def _street_like_kitti(folder: Path) -> DrivingScene:
         cameras=cameras,
         lidar=RigLidar(beams=32, columns=360),
     )
-    return DrivingScene.open(record_street(drawn_street(config), folder / "street"))
+    return DrivingScene.open(record_street(SyntheticStreet(config), folder / "street"))
 
 
 def _bag(folder: Path, write: Callable[..., object]) -> WrittenLog:
@@ -130,7 +135,7 @@ def _waymo(folder: Path, write: Callable[..., object]) -> WrittenLog:
         cameras=tuple(rig for rig in street_config().cameras if rig.name in ("FRONT", "SIDE_LEFT")),
         lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
     )
-    street = drawn_street(config)
+    street = SyntheticStreet(config)
     truth = write_truth(
         street, folder / "truth", near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
     )

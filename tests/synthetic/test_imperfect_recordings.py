@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 from camera_rows import camera_rows
-from drawn_streets import drawn_street
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigCamera, SyntheticStreetConfig
+from lidarpainter_models.synthetic import RigCamera, SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.plan.ego_motion import Pace
 from lidarpainter_models.synthetic.sequence import record_street
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
@@ -28,7 +27,7 @@ def with_camera(**changes):
 
 def driven_at(speed_mps, **camera):
     """The street of the seed with another pace of the recording car alone."""
-    street = drawn_street(with_camera(**camera))
+    street = SyntheticStreet(with_camera(**camera))
     street._city = dataclasses.replace(
         street._city, ego=street._city.ego.at_speed(speed_mps, speed_mps)
     )
@@ -87,14 +86,14 @@ def test_a_walker_is_drawn_in_the_posture_of_the_moment():
 @pytest.mark.parametrize("is_told", [True, False])
 def test_the_readout_is_stored_where_it_is_told(tmp_path, is_told):
     config = dataclasses.replace(with_camera(readout_s=READOUT_S), is_readout_told=is_told)
-    scene = DrivingScene.open(record_street(drawn_street(config), tmp_path))
+    scene = DrivingScene.open(record_street(SyntheticStreet(config), tmp_path))
     stored = [row["rolling_shutter_s"] for row in camera_rows(scene)]
     assert stored == [READOUT_S if is_told else None] * SMALL["num_frames"]
 
 
 def test_a_turned_camera_shows_what_lies_to_the_left_of_its_stored_pose(tmp_path):
     turn = math.radians(2)
-    street = drawn_street(with_camera(yaw_error_rad=turn))
+    street = SyntheticStreet(with_camera(yaw_error_rad=turn))
     scene = DrivingScene.open(record_street(street, tmp_path))
     view = scene.views[1]
     true = street.camera("front_camera", view.timestamp_ns)
@@ -104,7 +103,7 @@ def test_a_turned_camera_shows_what_lies_to_the_left_of_its_stored_pose(tmp_path
 
 
 def test_a_late_camera_shows_a_later_moment(tmp_path):
-    street = drawn_street(with_camera(delay_s=0.1))
+    street = SyntheticStreet(with_camera(delay_s=0.1))
     scene = DrivingScene.open(record_street(street, tmp_path))
     now, later = scene.read_image(scene.views[0]), street.timestamps_ns[1]
     shown = street.render(street.camera("front_camera", later), later).rgb
@@ -118,7 +117,7 @@ def test_gain_drifts_with_time(tmp_path):
     images = []
     for drift in (0.0, -1.0):
         config = with_camera(gain=0.5, gain_drift=drift)
-        path = record_street(drawn_street(config), tmp_path / f"{drift}")
+        path = record_street(SyntheticStreet(config), tmp_path / f"{drift}")
         scene = DrivingScene.open(path)
         images.append(scene.read_image(scene.views[2]).float().mean())
     assert float(images[1] / images[0]) == pytest.approx(1 - 0.2, abs=0.01)

@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from drawn_streets import drawn_street
 
 from lidarpainter_models.synthetic import RigCamera, SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.plan.car_kinds import SHAPES
@@ -42,7 +41,7 @@ def street():
 
 @pytest.fixture(scope="module")
 def plain():
-    return drawn_street(PLAIN)
+    return SyntheticStreet(PLAIN)
 
 
 def front(street, time_s):

@@ -70,6 +70,7 @@ def grain(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
 def as_rgba(colour: np.ndarray, fourth: np.ndarray | float = 0.0) -> np.ndarray:
     """RGBA bytes of a float image (height, width, 3) in 0..255 and a channel in 0..1."""
     rgba = np.empty((*colour.shape[:2], 4), np.uint8)
-    rgba[..., :3] = np.clip(np.rint(colour), 0, 255)
+    # a saturating cast that rounds to the nearest, halves to even
+    rgba[..., :3] = cv2.multiply(colour, 1.0, dtype=cv2.CV_8U)
     rgba[..., 3] = np.clip(np.rint(np.asarray(fourth) * 255), 0, 255)
     return rgba

@@ -155,19 +155,21 @@ class SurfaceSet:
 
 
 _TO_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+_LINEAR_RGBA = np.stack([_TO_LINEAR] * 3 + [np.arange(256) / np.float32(255)], axis=1)[None]
+_LINEAR_RGBA = _LINEAR_RGBA.astype(np.float32)
 _TO_BYTE = np.rint(srgb_from_linear(np.arange(4096) / 4095.0) * 255).astype(np.uint8)
 
 
 def _pyramid(rgba: np.ndarray) -> list[np.ndarray]:
     """Levels of halved size, averaged in linear light; sizes round down like the sampler's."""
     levels = [np.ascontiguousarray(rgba)]
-    linear = np.concatenate([_TO_LINEAR[rgba[..., :3]], rgba[..., 3:] / np.float32(255)], -1)
+    linear = cv2.LUT(levels[0], _LINEAR_RGBA)
     while max(linear.shape[:2]) > 1 and len(levels) < layout.MAX_LEVELS:
         level = len(levels)
         size = (max(rgba.shape[1] >> level, 1), max(rgba.shape[0] >> level, 1))
         linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 4)
         image = np.empty(linear.shape, np.uint8)
-        image[..., :3] = _TO_BYTE[(linear[..., :3] * 4095 + 0.5).astype(np.uint16)]
+        np.take(_TO_BYTE, (linear[..., :3] * 4095 + 0.5).astype(np.uint16), out=image[..., :3])
         image[..., 3] = linear[..., 3] * 255 + 0.5
         levels.append(image)
     return levels

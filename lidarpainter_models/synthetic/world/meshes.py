@@ -109,7 +109,7 @@ class MeshBuilder:
         geometry[:, 6:9] = corners[:, 2] - corners[:, 0]
         geometry[:, IS_PARALLELOGRAM] = float(is_parallelogram)
         if normals is None:
-            flat = np.cross(geometry[:, 3:6], geometry[:, 6:9])
+            flat = _cross(geometry[:, 3:6], geometry[:, 6:9])
             flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
             normals = np.repeat(flat[:, None], 3, axis=1)
         shading = np.zeros((count, SHADING_COLUMNS))
@@ -146,6 +146,13 @@ class MeshBuilder:
                 surface,
                 normals=None if normals is None else cell_corners(normals, order),
             )
+
+
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The cross product of rows (rows, 3): `np.cross` takes six times as long for a few."""
+    x, y, z = first.T
+    u, v, w = second.T
+    return np.stack((y * w - z * v, z * u - x * w, x * v - y * u), axis=1)
 
 
 def cell_corners(values: np.ndarray, order: tuple[int, int, int]) -> np.ndarray:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from drawn_streets import drawn_street
 from waymo_components import write_v2
 from waymo_edits import FILE, refused_line
 from waymo_numbers import SEGMENT
@@ -31,7 +30,7 @@ class WaymoFolder:
 
 @pytest.fixture(scope="session")
 def street() -> SyntheticStreet:
-    return drawn_street(street_config())
+    return SyntheticStreet(street_config())
 
 
 @pytest.fixture(scope="session")
@@ -51,7 +50,7 @@ def tiny_truth(street, tmp_path_factory) -> WaymoTruth:
     )
     folder = tmp_path_factory.mktemp("tiny-truth")
     return write_truth(
-        drawn_street(config), folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
+        SyntheticStreet(config), folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
     )
 
 
