@@ -12,6 +12,8 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
+SMALL_BYTES = 1 << 20
+
 
 def read_rows(
     there: ds.Dataset, wanted: pa.Schema, where: Mapping[str, Collection[str]] | None
@@ -27,13 +29,19 @@ def read_rows(
     keys = pa.schema([there.schema.field(name) for name in asked])
     found = [wanted.empty_table()]
     for fragment in there.get_fragments():
-        with fragment.open() as file, pq.ParquetFile(file, pre_buffer=False) as parquet:
+        with fragment.open() as file, _parquet(file) as parquet:
             if where is None:
                 found.append(_read(parquet, wanted))
             # compared here, as Arrow cannot compare the statistics of Delta's texts
             elif pc.any(mask := _has_one_of(_read(parquet, keys), asked)).as_py():
                 found.append(_read(parquet, wanted).filter(mask))
     return pa.concat_tables(found)
+
+
+def _parquet(file: pa.NativeFile) -> pq.ParquetFile:
+    """A file to read columns of; a small one is read at once, as each column is a request."""
+    source = pa.BufferReader(file.read()) if file.size() <= SMALL_BYTES else file
+    return pq.ParquetFile(source, pre_buffer=False)
 
 
 def _read(parquet: pq.ParquetFile, wanted: pa.Schema) -> pa.Table:

@@ -1,5 +1,7 @@
 """Smooth random fields that textures are made of."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -71,6 +73,7 @@ def as_rgba(colour: np.ndarray, fourth: np.ndarray | float = 0.0) -> np.ndarray:
     """RGBA bytes of a float image (height, width, 3) in 0..255 and a channel in 0..1."""
     rgba = np.empty((*colour.shape[:2], 4), np.uint8)
     # a saturating cast that rounds to the nearest, halves to even
-    rgba[..., :3] = cv2.multiply(colour, 1.0, dtype=cv2.CV_8U)
+    ones: Any = 1.0
+    rgba[..., :3] = cv2.multiply(colour, ones, dtype=cv2.CV_8U)
     rgba[..., 3] = np.clip(np.rint(np.asarray(fourth) * 255), 0, 255)
     return rgba

@@ -155,15 +155,16 @@ class SurfaceSet:
 
 
 _TO_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
-_LINEAR_RGBA = np.stack([_TO_LINEAR] * 3 + [np.arange(256) / np.float32(255)], axis=1)[None]
-_LINEAR_RGBA = _LINEAR_RGBA.astype(np.float32)
+_LINEAR_RGBA: Any = np.stack(
+    [*[_TO_LINEAR] * 3, (np.arange(256) / np.float32(255)).astype(np.float32)], axis=1
+)[None]
 _TO_BYTE = np.rint(srgb_from_linear(np.arange(4096) / 4095.0) * 255).astype(np.uint8)
 
 
 def _pyramid(rgba: np.ndarray) -> list[np.ndarray]:
     """Levels of halved size, averaged in linear light; sizes round down like the sampler's."""
     levels = [np.ascontiguousarray(rgba)]
-    linear = cv2.LUT(levels[0], _LINEAR_RGBA)
+    linear: np.ndarray = cv2.LUT(levels[0], _LINEAR_RGBA)
     while max(linear.shape[:2]) > 1 and len(levels) < layout.MAX_LEVELS:
         level = len(levels)
         size = (max(rgba.shape[1] >> level, 1), max(rgba.shape[0] >> level, 1))
