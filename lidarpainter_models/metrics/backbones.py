@@ -150,10 +150,15 @@ def read_tensors(path: Path, what: str) -> dict[str, Tensor]:
     return {str(key): value for key, value in state.items()}
 
 
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal digits: which published file it is."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def is_published(path: Path, backbone: Backbone) -> bool:
     """Whether a file is torchvision's own, by its SHA-256."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest().startswith(backbone.published)
+    return sha256_of(path).startswith(backbone.published)
 
 
 def load_stack(path: Path, backbone: Backbone) -> FeatureStack:

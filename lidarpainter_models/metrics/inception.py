@@ -6,7 +6,6 @@ weights come from a file that the user supplies: `pt_inception-2015-12-05-672682
 pytorch-fid and torch-fidelity publish. No other network is taken for it.
 """
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.metrics.backbones import read_tensors
+from lidarpainter_models.metrics.backbones import read_tensors, sha256_of
 
 PUBLISHED = "6726825d"
 """First eight digits of the SHA-256 of the file, as they stand in its name."""
@@ -218,8 +217,7 @@ def load_inception(path: Path, device: torch.device | None = None) -> Inception:
         WeightsError: the file is missing, unreadable, or not the published one.
     """
     state = read_tensors(path, "Inception")
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    digest = sha256_of(path)
     if not digest.startswith(PUBLISHED):
         raise WeightsError(
             f"{path} is not the published Inception of FID: its SHA-256 begins with "
