@@ -159,8 +159,8 @@ METRICS = TableSchema(
         Column(
             "protocol",
             "text",
-            "recorded, recorded-poses, truth, depth, neurad, cross-camera, markings, flicker, "
-            "lidar or envelope",
+            "recorded, recorded-poses, truth, likeness (FID and KID), depth, neurad, cross-camera, "
+            "markings, flicker, lidar or envelope",
         ),
         Column("trajectory", "text", "where the camera was: recorded, left-2m, up, ..."),
         Column("variant", "text", "unpainted, painted, refined (no painter), or view-time"),

@@ -13,6 +13,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 SMALL_BYTES = 1 << 20
+"""A file up to this size is read whole: from a bucket that takes as long as one of its columns."""
 
 
 def read_rows(
@@ -20,8 +21,8 @@ def read_rows(
 ) -> pa.Table:
     """The rows of a dataset in the columns of a schema; a column that it lacks is null.
 
-    `where` takes rows with one of some values in any of these columns, None all. Of each file only
-    these columns are read, and of those with such a row the wanted ones.
+    `where` takes rows with one of some values in any of these columns, None all. Of each file that
+    is not small only these columns are read, and of those with such a row the wanted ones.
     """
     asked = {name: values for name, values in (where or {}).items() if name in there.schema.names}
     if where is not None and not any(asked.values()):
@@ -39,7 +40,7 @@ def read_rows(
 
 
 def _parquet(file: pa.NativeFile) -> pq.ParquetFile:
-    """A file to read columns of; a small one is read at once, as each column is a request."""
+    """A file to read columns of; a small one is read at once."""
     source = pa.BufferReader(file.read()) if file.size() <= SMALL_BYTES else file
     return pq.ParquetFile(source, pre_buffer=False)
 

@@ -64,15 +64,15 @@ def shared_folder() -> Path:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the folder of drawn streets, for this process and those it starts."""
-    if FOLDER not in os.environ:
+    """Make the folder of drawn streets, for this process and its workers."""
+    if not hasattr(config, "workerinput"):
         os.environ[FOLDER] = tempfile.mkdtemp(prefix="drawn-streets-")
         config.add_cleanup(partial(shutil.rmtree, os.environ[FOLDER]))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _streets_drawn_once() -> None:
-    """Read a street that any process of this test run has drawn."""
+    """Read a street that any worker of this test run has drawn."""
     from drawn_streets import kept_city
 
     from lidarpainter_models.synthetic import street

@@ -31,10 +31,10 @@ FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pair
 WORDS = """
 protocol: How the run is scored: paper (held-out views, and views beside the path where they are
   known), truth (views beside the path of a synthetic street, against exact images), neurad (every
-  held-out image at its recorded pose, for runs with --split linspace: the protocol of
-  neurad-studio), cross-camera (cameras that no fit saw), markings (painted lines, where LiDAR
-  points tell them), flicker (neighbouring frames against each
-  other), or lidar (simulated sweeps against those of held-out frames).
+  held-out image at its recorded pose, FID there and beside the path, for runs with --split
+  linspace: the protocol of neurad-studio), cross-camera (cameras that no fit saw), markings
+  (painted lines, where LiDAR points tell them), flicker (neighbouring frames against each other),
+  or lidar (simulated sweeps against those of held-out frames).
 postpaint: Also score what is painted at view time.
 painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the run's own
   if absent. Scores of another one are printed, but not entered into the catalog.

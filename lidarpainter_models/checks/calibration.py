@@ -3,9 +3,9 @@
 The points at depth edges (`checks.depth_edges`) are projected into the images of several frames,
 turned by up to two degrees this way and that; the turn under which they lie best on image edges is
 how far the camera's stated rotation is off (the idea of Levinson and Thrun, 2013, with a search in
-place of their gradient). A turn about the optical axis (roll) is looked for last, at the best yaw
-and pitch and at none (a roll can look like a small one of these), and judged where it stands out:
-it moves the sides of an image alone.
+place of their gradient). A turn about the optical axis (roll) is looked for after yaw and pitch, at
+the best of these and at none (a roll can look like a small one of them), and judged where it stands
+out: it moves the sides of an image alone. Where it does, yaw and pitch are looked for once more.
 
 Edges alone lie: a guard rail beside a lane fits the next marking as well. So a camera fails only
 where a second kind of evidence agrees (what the images of a moving car show of the same points);
@@ -29,7 +29,7 @@ MAX_TURN_DEG = 0.6
 
 Sound cameras of PandaSet 002 and of synthetic streets are found within 0.25 degrees, one step of
 the search (one of twelve at 0.5 in roll); those a degree off in yaw or pitch at 0.75 at least. Of
-twelve rolls of a degree planted in PandaSet 002 ten are found, the others at 0.5 and as a pitch.
+twelve rolls of a degree planted in PandaSet 002 eleven are found, and the last one at 0.5.
 """
 MIN_PEAK = 3.5
 """How many deviations the best turn must stand out from the turns around it to be believed.
@@ -150,7 +150,10 @@ def best_turn(images: Sequence[EdgeImage]) -> CameraTurn:
     sought again with it.
     """
     turn = _turn_around(images, 0.0)
-    return _turn_around(images, turn.roll_deg) if turn.is_rolled else turn
+    if not turn.is_rolled:
+        return turn
+    again = _turn_around(images, turn.roll_deg)
+    return again if again.is_rolled else turn
 
 
 def _turn_around(images: Sequence[EdgeImage], roll_deg: float) -> CameraTurn:

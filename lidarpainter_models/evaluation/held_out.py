@@ -72,9 +72,15 @@ class HeldOut:
             return camera
         return fitted.refined_camera(view, camera)
 
-    def shifted_camera(self, fitted: GaussianScene, view: RecordedView, shift: Shift) -> Camera:
-        """The interpolated camera moved beside the path."""
-        camera = self.camera_of(fitted, view, "interpolated")
+    def shifted_camera(
+        self,
+        fitted: GaussianScene,
+        view: RecordedView,
+        shift: Shift,
+        poses: Poses = "interpolated",
+    ) -> Camera:
+        """The camera of a view moved beside the path."""
+        camera = self.camera_of(fitted, view, poses)
         direction = self._directions[self.scene.frame_position(view.frame_index)]
         return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 

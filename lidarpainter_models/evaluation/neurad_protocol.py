@@ -9,7 +9,7 @@ makes a figure unlike a published one stands beside it: how large the images wer
 were, and why a distance is absent.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -23,10 +23,9 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.score_tables import NEURAD, Scores
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.view_scores import ScoredView, score_views
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 
 SPLIT = "linspace"
@@ -69,9 +68,8 @@ def neurad_scores(
     found: dict[str, dict[str, Any]] = {}
     cameras = [view.camera_name for view in held_out.test_views]
     for name in dict.fromkeys(cameras):
-        cut = CUT_ROWS.get((held_out.scene.dataset, name), 0.0)
         own = [
-            cropped(view, cut)
+            cropped(view, num_kept_rows(held_out.scene, name, view.camera.height_px))
             for view, camera in zip(views, cameras, strict=True)
             if camera == name
         ]
@@ -98,32 +96,30 @@ def _likeness(
     """FID and KID at each shift, against the held-out images, all without the rows cut off."""
     scene = held_out.scene
     views = [] if distances.inception is None else held_out.test_views
-    directions = road_directions(scene.world_from_ego)
 
     def kept(
         image: Float[Tensor, "height width 3"], view: RecordedView
     ) -> Float[Tensor, "_height width 3"]:
-        cut = CUT_ROWS.get((scene.dataset, view.camera_name), 0.0)
-        return image[: round(len(image) * (1 - cut))]
+        return image[: num_kept_rows(scene, view.camera_name, len(image))]
 
-    def moved(view: RecordedView, shift: Shift) -> Camera:
-        camera = held_out.camera_of(shown.scene, view, "recorded")
-        direction = directions[scene.frame_position(view.frame_index)]
-        return camera.at(shift_pose(camera.world_from_camera, direction, shift))
+    def shifted(shift: Shift) -> Iterator[Float[Tensor, "_height _width 3"]]:
+        placed = [
+            (view, held_out.shifted_camera(shown.scene, view, shift, "recorded")) for view in views
+        ]
+        return map(kept, shown_images(shown, placed, told), views)
 
-    beside = {
-        shift.name: map(
-            kept, shown_images(shown, [(view, moved(view, shift)) for view in views], told), views
-        )
-        for shift in SHIFTS
-    }
     real = map(kept, map(held_out.image_of, views), views)
-    return fid_scores(distances.inception, real, beside)
+    return fid_scores(distances.inception, real, {shift.name: shifted(shift) for shift in SHIFTS})
 
 
-def cropped(view: ScoredView, cut_share: float) -> ScoredView:
-    """The view without such a part of its rows at the bottom; all that is left is judged."""
-    rows = round(view.camera.height_px * (1 - cut_share))
+def num_kept_rows(scene: DrivingScene, camera_name: str, num_rows: int) -> int:
+    """How many rows of a camera's images are judged, from the top."""
+    cut_share = CUT_ROWS.get((scene.dataset, camera_name), 0.0)
+    return round(num_rows * (1 - cut_share))
+
+
+def cropped(view: ScoredView, rows: int) -> ScoredView:
+    """The view with so many of its rows, from the top; all that is left is judged."""
     return replace(
         view, truth_rgb=view.truth_rgb[:rows], actor_index=view.actor_index[:rows], hidden=None
     )

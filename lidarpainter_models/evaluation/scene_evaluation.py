@@ -85,16 +85,16 @@ class SceneEvaluation:
         distances: PerceptualDistances,
         told: Callable[[], None],
     ) -> dict[str, dict[str, Any]]:
-        """FID and KID beside the path, per trajectory, against all recorded images.
+        """FID and KID beside the path, per trajectory, against recorded images.
 
-        The paper compares what is rendered beside the path with the recorded video; of both so many
-        images are taken as are judged, evenly over cameras and time.
+        The paper compares what is rendered beside the path with the recorded video: of that, as
+        many images are taken as views are judged, evenly over cameras and time.
         """
         scene = held_out.scene
         views = [] if distances.inception is None else held_out.test_views
         names = {view.camera_name for view in views}
         recorded = [view for view in scene.views if view.camera_name in names]
-        real = sampled_views(recorded, self.config.scoring.most_views or len(recorded))
+        real = sampled_views(recorded, len(views))
         beside = {
             shift.name: shown_images(
                 shown,

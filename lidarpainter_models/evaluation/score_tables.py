@@ -7,7 +7,9 @@ DEPTH = "depth_within_5_percent"
 FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
 NEURAD = "neurad"
-"""Entry of an evaluation by the protocol of neurad-studio, by camera."""
+"""Entry of an evaluation by the protocol of neurad-studio, by camera and by shift."""
+LIKENESS = {"fid", "kid"}
+"""Figures of a set of images against recorded ones; these are the truth of none of them."""
 LIDAR = "lidar"
 """Entry of an evaluation that judged simulated sweeps."""
 MARKINGS = "markings"
@@ -34,7 +36,7 @@ def metric_values(
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
     Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
-    have shifted paths alone, those by the protocol of neurad-studio cameras, those of
+    have shifted paths alone, those by the protocol of neurad-studio cameras and shifts, those of
     markings trajectories, and those of sweeps figures by whose protocol they are.
     """
     if "recorded" not in scores:
@@ -47,7 +49,8 @@ def metric_values(
         found.append(("recorded-poses", "recorded", name, value, _reason(recorded, name, value)))
     for trajectory, values in scores["novel"].items():
         for name, value in _numbers(values):
-            protocol = "depth" if name.startswith("depth") else "truth"
+            protocol = "likeness" if name in LIKENESS else "truth"
+            protocol = "depth" if name.startswith("depth") else protocol
             found.append((protocol, trajectory, name, value, _reason(values, name, value)))
     swept = _by_part({LIDAR: scores[LIDAR]}) if LIDAR in scores else []
     return [*found, *_trusted(scores.get(ENVELOPE)), *swept]

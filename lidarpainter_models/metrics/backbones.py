@@ -5,7 +5,6 @@ VGG-16 (Simonyan and Zisserman, 2015), the one-tower AlexNet of Krizhevsky (2014
 file that the user supplies; which published file it is, its SHA-256 says.
 """
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.storage.whole_files import sha256_of
 
 VGG16_CHANNELS = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
 """Channels and convolutions of every block; a max-pool stands between blocks."""
@@ -148,12 +148,6 @@ def read_tensors(path: Path, what: str) -> dict[str, Tensor]:
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
         raise WeightsError(f"{path} holds a {type(state).__name__}, expected a dict of tensors")
     return {str(key): value for key, value in state.items()}
-
-
-def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits: which published file it is."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_published(path: Path, backbone: Backbone) -> bool:

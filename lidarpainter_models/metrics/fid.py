@@ -1,8 +1,9 @@
 """How far one set of images is from another: FID and KID, of features of each image.
 
-FID (Heusel et al., 2017) is the distance of two normal distributions; of fewer images than features
-it depends on how many there are, so it may be compared at equal numbers alone. KID (Binkowski et
-al., "Demystifying MMD GANs", 2018) does not depend on that, and stands beside it.
+FID (Heusel et al., 2017) is the distance of two normal distributions. What it comes to on average
+depends on how many images there are, most where they are few (Chong and Forsyth, 2020), so it is
+compared at equal numbers only. KID (Binkowski et al., "Demystifying MMD GANs", 2018) comes to the
+same on average for any number, and stands beside it.
 """
 
 import torch
@@ -37,7 +38,8 @@ def kernel_distance(
 ) -> float:
     """KID: the unbiased squared maximum mean discrepancy by the kernel (x y / features + 1)^3.
 
-    All images are compared at once; those of means over random subsets agree on average.
+    All images are compared at once. Means over random subsets of them, as others take, have the
+    same expected value.
     """
     one, two = real.double(), other.double()
     within = [_mean_off_diagonal(_kernel(each, each)) for each in (one, two)]

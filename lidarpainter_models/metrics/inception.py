@@ -1,9 +1,10 @@
 """The Inception network by whose features FID and KID compare sets of images.
 
-It is the one that TensorFlow's authors of FID used (Szegedy et al., "Rethinking the Inception
+It is the TensorFlow network that the authors of FID used (Szegedy et al., "Rethinking the Inception
 Architecture", 2016, as trained in 2015), which differs from torchvision's in its poolings. Its
-weights come from a file that the user supplies: `pt_inception-2015-12-05-6726825d.pth`, which
-pytorch-fid and torch-fidelity publish. No other network is taken for it.
+weights come from a file that the user supplies: `pt_inception-2015-12-05-6726825d.pth` of
+pytorch-fid, or torch-fidelity's `weights-inception-2015-12-05-6726825d.pth`, which holds the same
+bytes. No other network is taken for it.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,7 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.metrics.backbones import read_tensors, sha256_of
+from lidarpainter_models.metrics.backbones import read_tensors
+from lidarpainter_models.storage.whole_files import sha256_of
 
 PUBLISHED = "6726825d"
 """First eight digits of the SHA-256 of the file, as they stand in its name."""
@@ -197,7 +199,8 @@ class Inception(nn.Module):
     ) -> Float[Tensor, "images 2048"]:
         """Features of images with rgb in 0..1, each brought to 299x299 bytes by bicubic weights.
 
-        So neurad-studio does (`ad_pipeline.py`); one image is looked at after the other.
+        neurad-studio does so (`ad_pipeline.py`), but for a rounding: it cuts the fractions of bytes
+        off before it resizes. One image is looked at after the other.
         """
         device = self.Conv2d_1a_3x3.conv.weight.device
         found = [self(_as_bytes(image.to(device)))[0] for image in images]

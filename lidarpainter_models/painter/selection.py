@@ -20,6 +20,7 @@ from lidarpainter_models.painter.known_painters import (
     is_model_name,
     split_preset,
 )
+from lidarpainter_models.storage.whole_files import sha256_of
 
 if TYPE_CHECKING:  # a name is read without them: a command refuses a mistyped one at once
     import torch
@@ -154,5 +155,4 @@ def file_digest(path: Path) -> str:
 @lru_cache(maxsize=64)
 def _remembered_digest(path: Path, size: int, changed_ns: int) -> str:  # noqa: ARG001 - the key
     """Read again only once the file, perhaps of gigabytes, has changed."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of(path)

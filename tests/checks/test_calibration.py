@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpainter_models.checks.calibration import CameraTurn, check_calibration, why_untold
+from lidarpainter_models.checks.calibration import (
+    CameraTurn,
+    best_turn,
+    check_calibration,
+    why_untold,
+)
 from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.doctor import check_licence
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
@@ -120,6 +125,17 @@ def test_camera_of_the_real_log_turned_by_a_degree_is_found(real_log, camera, ax
     verdict, detail = checked(turned(real_log, camera, axis, angle_deg))
     assert verdict != "ok", detail
     assert detail.startswith(f"{camera} turned")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["left_camera", "back_camera"])
+def test_a_roll_is_not_taken_for_a_pitch(real_log, camera):
+    """Before the roll is known these cameras look pitched by most of a degree."""
+    edges = SceneEdges(turned(real_log, camera, ROLL, 1.0))
+    turn = best_turn(edges.images[camera])
+    assert turn.is_rolled
+    assert turn.roll_deg == pytest.approx(1.0, abs=0.5)
+    assert abs(turn.pitch_deg) <= 0.25
 
 
 @pytest.mark.parametrize(

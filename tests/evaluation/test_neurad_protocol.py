@@ -10,6 +10,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.neurad_protocol import neurad_scores
 from lidarpainter_models.evaluation.score_tables import NEURAD, metric_values
 from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.geometry.trajectories import road_directions
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -28,8 +29,8 @@ def held_out():
     return HeldOut(scene=street, test_views=tests, observation=ObservationConfig(width_px=WIDTH_PX))
 
 
-def scores(held_out, wrong_rows, distances=None):
-    """Of images that are exact but for so many rows at the bottom."""
+def scores(held_out, wrong_rows, distances=None, seen=None):
+    """Of images that are exact but for so many rows at the bottom; `seen` takes the cameras."""
     views = held_out.scene.views
     fitted = scene_trained_on([view for view in views if view.frame_index % 2 == 0])
     truths = {
@@ -39,7 +40,9 @@ def scores(held_out, wrong_rows, distances=None):
 
     class Shown(ShownScene):
         def renderer(self, camera_name):
-            def render(_camera, timestamp_ns):
+            def render(camera, timestamp_ns):
+                if seen is not None:
+                    seen.append((camera, timestamp_ns))
                 image = truths[camera_name, timestamp_ns].clone()
                 bottom = image[len(image) - wrong_rows :]
                 bottom += torch.where(bottom > WRONG, -WRONG, WRONG)
@@ -100,9 +103,18 @@ def test_fid_compares_what_is_left_of_images_at_every_shift(held_out):
         observation=held_out.observation,
     )
     network = PerceptualDistances(inception=MeansAsFeatures())
-    exact = scores(back, wrong_rows=cut, distances=network)[NEURAD]
+    seen = []
+    exact = scores(back, wrong_rows=cut, distances=network, seen=seen)[NEURAD]
     wrong = scores(back, wrong_rows=cut + 4, distances=network)[NEURAD]
     for name in ("all", "left-2m", "right-2m", "left-3m", "right-3m", "up-1m"):
         assert exact[name]["fid"] == pytest.approx(0, abs=1e-9)
         assert wrong[name]["fid"] > 1e-4
         assert (exact[name]["num_real"], exact[name]["num_shown"]) == (2, 2)
+    recorded = {view.timestamp_ns: view.camera for view in back.test_views}
+    ahead = road_directions(held_out.scene.world_from_ego)[0]
+    left = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), ahead)
+    moves = [camera.centre_world - recorded[time].centre_world for camera, time in seen]
+    sides = [round(float(move @ left / left.norm()), 2) for move in moves]
+    # each of the two views as it is judged, then at every shift
+    assert sides == [0, 0, 0, 0, 2, 2, -2, -2, 3, 3, -3, -3, 0, 0]
+    assert [round(float(move[2]), 2) for move in moves] == [0] * 12 + [1, 1]

@@ -80,6 +80,49 @@ def test_grids_shrink_as_published(network):
     assert seen["Mixed_7c"] == (2048, 8, 8)
 
 
+def test_averages_leave_out_the_border_and_the_last_module_takes_the_largest(network):
+    """As TensorFlow pools: a constant stays what it is up to the edge."""
+    for name, inputs in (("Mixed_5b", 192), ("Mixed_6e", 768), ("Mixed_7b", 1280)):
+        module_ = getattr(network, name)
+        flat = module_._pooled(torch.ones(1, inputs, 5, 5))
+        assert torch.allclose(flat, flat[..., 2:3, 2:3].expand_as(flat), atol=1e-5), name
+    one = torch.zeros(1, 2048, 5, 5)
+    one[..., 2, 2] = 1.0
+    spread = network.Mixed_7c._pooled(one)[0].flatten(1)
+    around = spread.reshape(-1, 5, 5)[:, 1:4, 1:4].flatten(1)
+    assert torch.allclose(around, around[:, 4:5].expand_as(around), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [
+        ("Mixed_5c", ["branch1x1", "branch5x5_2", "branch3x3dbl_3", "branch_pool"]),
+        ("Mixed_6a", ["branch3x3", "branch3x3dbl_3"]),
+        ("Mixed_6c", ["branch1x1", "branch7x7_3", "branch7x7dbl_5", "branch_pool"]),
+        ("Mixed_7a", ["branch3x3_2", "branch7x7x3_4"]),
+        (
+            "Mixed_7b",
+            [
+                *("branch1x1", "branch3x3_2a", "branch3x3_2b"),
+                *("branch3x3dbl_3a", "branch3x3dbl_3b", "branch_pool"),
+            ],
+        ),
+    ],
+)
+def test_branches_are_joined_in_the_published_order(name, order):
+    """The last layer of each branch says its number, whatever it is given."""
+    layer = getattr(Inception().eval(), name)
+    widths = []
+    for number, branch in enumerate(order, start=1):
+        last = layer.get_submodule(branch)
+        last.register_forward_hook(lambda _l, _g, made, n=number: torch.full_like(made, n))
+        widths.append(last.conv.out_channels)
+    inputs = {"Mixed_5c": 256, "Mixed_6a": 288, "Mixed_7b": 1280}.get(name, 768)
+    found = layer(torch.zeros(1, inputs, 9, 9))[0, : sum(widths), 0, 0]
+    expected = [n for n, width in enumerate(widths, start=1) for _ in range(width)]
+    assert found.tolist() == expected
+
+
 def test_images_are_brought_to_bytes_of_the_networks_size():
     wide = torch.linspace(0, 1, 600)[None, :, None].expand(300, 600, 3)
     sized = module._as_bytes(wide)

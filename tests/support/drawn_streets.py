@@ -1,6 +1,6 @@
-"""Each synthetic street is drawn once for all processes of a test run: drawing one takes seconds.
+"""Each synthetic street is drawn once for all workers of pytest: drawing one takes seconds.
 
-A street is all in the settings of its world, so what one process has drawn the others read from a
+A street is all in the settings of its world, so what one worker has drawn the others read from a
 file. `conftest` makes their folder and puts `kept_city` where streets are drawn.
 """
 
@@ -23,5 +23,7 @@ def kept_city(**world):
         if path.exists():
             return pickle.loads(path.read_bytes())  # noqa: S301 - our own file
         city = build_city(**world)
-        path.write_bytes(pickle.dumps(city, protocol=pickle.HIGHEST_PROTOCOL))
+        begun = path.with_suffix(".begun")
+        begun.write_bytes(pickle.dumps(city, protocol=pickle.HIGHEST_PROTOCOL))
+        begun.rename(path)
         return city
