@@ -9,7 +9,7 @@ FLICKER = "flicker"
 NEURAD = "neurad"
 """Entry of an evaluation by the protocol of neurad-studio, by camera and by shift."""
 LIKENESS = {"fid", "kid"}
-"""Figures of a set of images against recorded ones; these are the truth of none of them."""
+"""Figures that compare a set of images with recorded images of other places."""
 LIDAR = "lidar"
 """Entry of an evaluation that judged simulated sweeps."""
 MARKINGS = "markings"
@@ -49,11 +49,17 @@ def metric_values(
         found.append(("recorded-poses", "recorded", name, value, _reason(recorded, name, value)))
     for trajectory, values in scores["novel"].items():
         for name, value in _numbers(values):
-            protocol = "likeness" if name in LIKENESS else "truth"
-            protocol = "depth" if name.startswith("depth") else protocol
-            found.append((protocol, trajectory, name, value, _reason(values, name, value)))
+            place = (_truth_of(name), trajectory, name)
+            found.append((*place, value, _reason(values, name, value)))
     swept = _by_part({LIDAR: scores[LIDAR]}) if LIDAR in scores else []
     return [*found, *_trusted(scores.get(ENVELOPE)), *swept]
+
+
+def _truth_of(name: str) -> str:
+    """What a figure beside the path was taken against."""
+    if name in LIKENESS:
+        return "likeness"
+    return "depth" if name.startswith("depth") else "truth"
 
 
 def _by_part(scores: Mapping[str, Any]) -> list[tuple[str, str, str, float | None, str | None]]:

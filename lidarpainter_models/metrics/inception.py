@@ -9,7 +9,7 @@ bytes. No other network is taken for it.
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -27,8 +27,17 @@ SIDE_PX = 299
 NO_WEIGHTS = "FID and KID need the weights of Inception, which the user supplies: none given"
 
 Pooling = Literal["average", "max"]
-Layer = tuple[str, int, tuple[int, int]]
-"""Name, channels and kernel (rows, columns) of a convolution that keeps the size."""
+
+
+class Layer(NamedTuple):
+    """A convolution of a branch."""
+
+    name: str
+    outputs: int
+    kernel: tuple[int, int]
+    """Rows and columns."""
+
+
 Fork = tuple[Layer, ...]
 """Convolutions side by side that end a branch."""
 
@@ -69,15 +78,15 @@ class Mixed(nn.Module):
         for branch in branches:
             channels, names = inputs, list[list[str]]()
             for position, step in enumerate(branch):
-                fork: Fork = step if isinstance(step[0], tuple) else (step,)  # type: ignore[assignment]
+                fork = (step,) if isinstance(step, Layer) else step
                 is_last = self.halves and position == len(branch) - 1
                 for name, outputs, kernel in fork:
                     layer = Convolution(
                         channels, outputs, kernel, stride=1 + is_last, pads=not is_last
                     )
                     self.add_module(name, layer)
-                names.append([name for name, _outputs, _kernel in fork])
-                channels = fork[-1][1]
+                names.append([one.name for one in fork])
+                channels = fork[-1].outputs
             self.branches.append(names)
         if pooled:
             self.branch_pool = Convolution(inputs, pooled, (1, 1), pads=False)
@@ -105,46 +114,49 @@ class Mixed(nn.Module):
         return self.branch_pool(average)
 
 
+_DOUBLE = (
+    Layer("branch3x3dbl_1", 64, (1, 1)),
+    Layer("branch3x3dbl_2", 96, (3, 3)),
+    Layer("branch3x3dbl_3", 96, (3, 3)),
+)
+"""Two 3x3 convolutions in place of a 5x5 one."""
+
+
 def _small(inputs: int, pooled: int) -> Mixed:
     """A module of the 35x35 grid."""
-    five = (("branch5x5_1", 48, (1, 1)), ("branch5x5_2", 64, (5, 5)))
-    double = (
-        ("branch3x3dbl_1", 64, (1, 1)),
-        ("branch3x3dbl_2", 96, (3, 3)),
-        ("branch3x3dbl_3", 96, (3, 3)),
-    )
-    return Mixed(inputs, [[("branch1x1", 64, (1, 1))], five, double], pooled=pooled)
+    five = (Layer("branch5x5_1", 48, (1, 1)), Layer("branch5x5_2", 64, (5, 5)))
+    return Mixed(inputs, [[Layer("branch1x1", 64, (1, 1))], five, _DOUBLE], pooled=pooled)
 
 
 def _seven(channels: int) -> Mixed:
     """A module of the 17x17 grid, whose 7x7 convolutions are split into rows and columns."""
     once = (
-        ("branch7x7_1", channels, (1, 1)),
-        ("branch7x7_2", channels, (1, 7)),
-        ("branch7x7_3", 192, (7, 1)),
+        Layer("branch7x7_1", channels, (1, 1)),
+        Layer("branch7x7_2", channels, (1, 7)),
+        Layer("branch7x7_3", 192, (7, 1)),
     )
     twice = (
-        ("branch7x7dbl_1", channels, (1, 1)),
-        ("branch7x7dbl_2", channels, (7, 1)),
-        ("branch7x7dbl_3", channels, (1, 7)),
-        ("branch7x7dbl_4", channels, (7, 1)),
-        ("branch7x7dbl_5", 192, (1, 7)),
+        Layer("branch7x7dbl_1", channels, (1, 1)),
+        Layer("branch7x7dbl_2", channels, (7, 1)),
+        Layer("branch7x7dbl_3", channels, (1, 7)),
+        Layer("branch7x7dbl_4", channels, (7, 1)),
+        Layer("branch7x7dbl_5", 192, (1, 7)),
     )
-    return Mixed(768, [[("branch1x1", 192, (1, 1))], once, twice], pooled=192)
+    return Mixed(768, [[Layer("branch1x1", 192, (1, 1))], once, twice], pooled=192)
 
 
 def _forked(inputs: int, pooling: Pooling) -> Mixed:
     """A module of the 8x8 grid, whose 3x3 convolutions end in rows and columns side by side."""
     once = (
-        ("branch3x3_1", 384, (1, 1)),
-        (("branch3x3_2a", 384, (1, 3)), ("branch3x3_2b", 384, (3, 1))),
+        Layer("branch3x3_1", 384, (1, 1)),
+        (Layer("branch3x3_2a", 384, (1, 3)), Layer("branch3x3_2b", 384, (3, 1))),
     )
     twice = (
-        ("branch3x3dbl_1", 448, (1, 1)),
-        ("branch3x3dbl_2", 384, (3, 3)),
-        (("branch3x3dbl_3a", 384, (1, 3)), ("branch3x3dbl_3b", 384, (3, 1))),
+        Layer("branch3x3dbl_1", 448, (1, 1)),
+        Layer("branch3x3dbl_2", 384, (3, 3)),
+        (Layer("branch3x3dbl_3a", 384, (1, 3)), Layer("branch3x3dbl_3b", 384, (3, 1))),
     )
-    branches = [[("branch1x1", 320, (1, 1))], once, twice]
+    branches = [[Layer("branch1x1", 320, (1, 1))], once, twice]
     return Mixed(inputs, branches, pooling=pooling, pooled=192)
 
 
@@ -163,20 +175,15 @@ class Inception(nn.Module):
             _small(256, 64),
             _small(288, 64),
         )
-        double = (
-            ("branch3x3dbl_1", 64, (1, 1)),
-            ("branch3x3dbl_2", 96, (3, 3)),
-            ("branch3x3dbl_3", 96, (3, 3)),
-        )
-        self.Mixed_6a = Mixed(288, [[("branch3x3", 384, (3, 3))], double])
+        self.Mixed_6a = Mixed(288, [[Layer("branch3x3", 384, (3, 3))], _DOUBLE])
         self.Mixed_6b, self.Mixed_6c, self.Mixed_6d = _seven(128), _seven(160), _seven(160)
         self.Mixed_6e = _seven(192)
-        once = (("branch3x3_1", 192, (1, 1)), ("branch3x3_2", 320, (3, 3)))
+        once = (Layer("branch3x3_1", 192, (1, 1)), Layer("branch3x3_2", 320, (3, 3)))
         seven = (
-            ("branch7x7x3_1", 192, (1, 1)),
-            ("branch7x7x3_2", 192, (1, 7)),
-            ("branch7x7x3_3", 192, (7, 1)),
-            ("branch7x7x3_4", 192, (3, 3)),
+            Layer("branch7x7x3_1", 192, (1, 1)),
+            Layer("branch7x7x3_2", 192, (1, 7)),
+            Layer("branch7x7x3_3", 192, (7, 1)),
+            Layer("branch7x7x3_4", 192, (3, 3)),
         )
         self.Mixed_7a = Mixed(768, [once, seven])
         self.Mixed_7b, self.Mixed_7c = _forked(1280, "average"), _forked(2048, "max")

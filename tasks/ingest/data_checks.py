@@ -39,9 +39,9 @@ Bodies = Callable[[], dict[str, Bool[np.ndarray, "height width"]]]
 CAMERA_FAULTS = "camera faults"
 CORRECTS = "--set observation.corrects_cameras=true"
 TRIAL_FRAMES = slice(0, 6)
+"""A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
 LOOKED_AT = (0.35, 0.87, 0.99, 1.0)
 """Part of the time that is over after each look of `findings_about`: of four logs."""
-"""A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
 
 
 def check_stored_scene(
