@@ -23,7 +23,7 @@ test: lint
 
 # what takes too long for every change: runs killed and resumed, thousands of damaged logs
 nightly: $(INSTALLED) $(SYSTEM)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2
 
 lint: $(INSTALLED) $(SYSTEM)
 	$(BIN)/ruff check .

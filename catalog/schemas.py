@@ -250,7 +250,7 @@ ATTEMPTS = TableSchema(
         ),
         Column("reason", "text", "one line about the cause"),
         Column("effort", "text", "what its cost grows with, JSON; null unless it made all stages"),
-        Column("predicted_seconds", "number", "what the planner said before", "s"),
+        Column("predicted_seconds", "number", "what the forecast said before", "s"),
         Column("predicted_cpu_seconds", "number", "likewise, without compiling", "s"),
         Column("predicted_memory_bytes", "integer", "likewise", "byte"),
         Column("predicted_num_bytes", "integer", "likewise", "byte"),

@@ -10,7 +10,7 @@ from catalog.store import Store
 from flows.parameters import view_parameters
 from lidarpainter_models.evaluation.score_tables import LIDAR
 from lidarpainter_models.export.simulated_sweeps import SweepRequest
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.lidar.firings import mounted_lidar
 from lidarpainter_models.lidar.sensors import PRESETS, LidarSensor
 from lidarpainter_models.storage.whole_files import write_whole

@@ -16,9 +16,9 @@ from flows.recall import START, early_end_recorded, located, recalled, run_ident
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import LIDAR, Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.metrics.perceptual import load_distances
-from lidarpainter_models.observations.fit_size import require_recorded_width
+from lidarpainter_models.observations.image_shrinking import require_recorded_width
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope

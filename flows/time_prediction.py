@@ -1,4 +1,4 @@
-"""How long the stages of a run take: the one model behind progress lines and the planner of fleets.
+"""How long the stages of a run take: the one model behind progress lines and fleets.
 
 What a stage takes on a known machine follows from the size of the run (`reference_seconds`). Past
 runs of the store tell how much longer each kind of stage takes on this one (`expected_seconds`),

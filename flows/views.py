@@ -14,7 +14,7 @@ from lidarpainter_models.evaluation.score_tables import ENVELOPE
 from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import RECORDING, UNPAINTED, ViewRequest
-from lidarpainter_models.observations.fit_size import require_recorded_width
+from lidarpainter_models.observations.image_shrinking import require_recorded_width
 from tasks.opened import open_scene
 from tasks.runs import FinishedRun, is_of_its_scene, lineage, open_run
 from tasks.specs import FittedRef

@@ -22,7 +22,7 @@ from lidarpainter_models.evaluation.flicker import FlickerFrame, FlickerTally
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.edges import edge_agreement
-from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.opened import open_scene

@@ -163,7 +163,7 @@ def report(
     out: Path = Path("fleet.html"),
     as_json: AsJson = False,
 ) -> None:
-    """Write one page about a fleet: throughput, failures, cost, quality, worst scenes, planner.
+    """Write one page about a fleet: throughput, failures, cost, quality, worst scenes, forecast.
 
     The page stands alone: nothing is loaded from elsewhere.
 
@@ -197,7 +197,7 @@ def _run_here(
     say_status(f"looking for the sequences of {asked.name}")
     from catalog.fleets import FleetLedger
     from catalog.store import open_store
-    from flows.fleet.asked import wishes
+    from flows.fleet.asked_sequences import wishes
     from flows.fleet.local_workers import run_workers, starter
     from flows.fleet.status import counts_of, fleet_status, is_over
 
@@ -248,11 +248,11 @@ def _show(status: dict[str, Any], *, as_json: bool) -> None:
     columns = ["scene", *apart, "state", "seconds", "attempts", "run_id", "reason"]
     cells = [[_in_words(one[name]) for name in columns] for one in rows]
     counts = ", ".join(f"{count} {state}" for state, count in status["counts"].items())
-    error = status["planner_error"]
+    error = status["forecast_error"]
     notes = [
         counts,
         *([f"held back: {status['held_back']}"] if status["held_back"] else []),
-        *([] if error is None else [f"the planner was off by {error:.0%} (median)"]),
+        *([] if error is None else [f"the forecast was off by {error:.0%} (median)"]),
     ]
     num_text_columns = 2 + len(apart)
     print_table(

@@ -22,7 +22,7 @@ from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
 from catalog.store import open_store
 from flows.environment import THREADS, prepare_environment
-from flows.fleet.asked import wishes
+from flows.fleet.asked_sequences import wishes
 from flows.fleet.flow_runs import FIRING, WORK, api_lost, close_lost_runs, open_runs, store_tag
 from flows.fleet.limits import lacks_disk, over_budget
 from flows.fleet.local_workers import THREAD_COUNTS

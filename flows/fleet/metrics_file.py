@@ -14,7 +14,7 @@ from catalog.errors import storage_errors
 from catalog.fleets import FleetLedger
 from catalog.retries import by_cause
 from catalog.tables import Row
-from flows.fleet.status import counts_of, planner_error
+from flows.fleet.status import counts_of, forecast_error
 
 PREFIX = "lidarpainter_fleet"
 SPENT = {
@@ -44,9 +44,9 @@ def write_metrics(ledger: FleetLedger, fleet: str, path: Path) -> None:
     if attempts:
         last = Gauge(f"{PREFIX}_last_end_seconds", "Since 1970.", ["fleet"], registry=registry)
         last.labels(fleet).set(max(row["ended_at"] for row in attempts).timestamp())
-    error = planner_error(attempts)
+    error = forecast_error(attempts)
     if error is not None:
-        off = Gauge(f"{PREFIX}_planner_error", "Median share.", ["fleet"], registry=registry)
+        off = Gauge(f"{PREFIX}_forecast_error", "Median share.", ["fleet"], registry=registry)
         off.labels(fleet).set(error)
     with storage_errors(f"cannot write {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from catalog.fleets import FleetLedger
 from catalog.retries import by_cause
 from catalog.tables import Row
 from flows.fleet.manifest import Budget
-from flows.fleet.status import counts_of, planner_error
+from flows.fleet.status import counts_of, forecast_error
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.export.pictures import WorstView, read_beside
 from lidarpainter_models.export.report import Cell, Plot, Report, Table
@@ -29,7 +29,7 @@ MOST_SCENES = 10
 QUALITY = ("psnr", "ssim", "lpips")
 FINAL_VARIANTS = ("painted", "refined")
 RUNNING_MEDIAN = 9
-"""Attempts whose errors are taken together in the chart of the planner."""
+"""Attempts whose errors are taken together in the chart of the forecast."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ def fleet_page(ledger: FleetLedger, fleet: str) -> Report:
             *_failures(record),
             _causes(record),
             _distribution("Quality of held-out views", quality),
-            _distribution("The planner: how far off, as a share of what it took", _errors(record)),
+            _distribution("The forecast: how far off, as a share of what it took", _errors(record)),
             _scenes("Worst scenes", record, worst),
             _scenes("Slowest scenes", record, slowest),
         ],
@@ -183,9 +183,9 @@ def _verdict(record: FleetRecord) -> list[str]:
         sentences.append(
             f"Held-out views: median {median(found):.1f} dB, worst scene {min(found):.1f} dB."
         )
-    error = planner_error(record.attempts)
+    error = forecast_error(record.attempts)
     if error is not None:
-        sentences.append(f"The planner was off by {error:.0%} (median).")
+        sentences.append(f"The forecast was off by {error:.0%} (median).")
     return sentences
 
 
@@ -310,7 +310,7 @@ def _plots(record: FleetRecord) -> list[Plot]:
             series={"held-out views": shares},
         ),
         Plot(
-            title="Planner",
+            title="Forecast",
             x_label="attempts that did their work",
             y_label=f"error of seconds in %, median of the last {RUNNING_MEDIAN}",
             series={"predicted seconds": smooth},

@@ -8,7 +8,7 @@ from catalog.retries import State
 from catalog.tables import Row
 from flows.fleet.limits import lacks_disk, over_budget
 from flows.fleet.manifest import Budget
-from flows.fleet.planner import planner_error
+from flows.fleet.resource_forecast import forecast_error
 
 STATES: tuple[State, ...] = get_args(State)
 SHOWN = (
@@ -44,7 +44,7 @@ def fleet_status(ledger: FleetLedger, fleet: str) -> dict[str, Any]:
             "cpu_seconds": sum(row["cpu_seconds"] or 0.0 for row in attempts),
             "attempts": len(attempts),
         },
-        "planner_error": planner_error(attempts),
+        "forecast_error": forecast_error(attempts),
     }
 
 

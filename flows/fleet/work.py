@@ -16,7 +16,7 @@ from catalog.artefacts import ArtefactRef
 from catalog.store import Store, open_store
 from flows.assets import publish_run
 from flows.derive import style_run
-from flows.fleet.asked import Asked
+from flows.fleet.asked_sequences import Asked
 from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
 from lidarpainter_models.evaluation.scene_evaluation import known_street

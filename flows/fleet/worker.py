@@ -21,13 +21,13 @@ from catalog.fleets import FleetLedger
 from catalog.leases import Holder, Lease
 from catalog.retries import Ending, attempt_id
 from catalog.tables import Row
-from flows.fleet.asked import Asked
+from flows.fleet.asked_sequences import Asked
 from flows.fleet.error_causes import cause_of, is_storage_away
 from flows.fleet.flow_runs import api_lost
 from flows.fleet.heartbeat import Heartbeat
 from flows.fleet.limits import admits, fits_beside, lacks_disk, over_budget, work_here
 from flows.fleet.manifest import Budget
-from flows.fleet.planner import Planner
+from flows.fleet.resource_forecast import ResourceForecast
 from flows.fleet.work import Work
 from flows.interruption import at_interruption
 from tasks.progress import ProgressListener, subject, working_on
@@ -35,7 +35,7 @@ from tasks.progress import ProgressListener, subject, working_on
 Event = Literal["said", "stage-began", "stage-waits", "stage-ended"]
 POLL_S = 2.0
 REPLAN_S = 30.0
-"""How long the planner goes by what it read last."""
+"""How long the forecast goes by what it read last."""
 MOST_HELD_BACK = 8
 """Sequences for which there is no memory now, before no further ones are looked at."""
 ENDED_ITSELF = 3
@@ -52,7 +52,7 @@ class Worker:
     say: Callable[[str], None]
     poll_s: float = POLL_S
     _told: str = ""
-    _plans: tuple[float, Planner] | None = None
+    _plans: tuple[float, ResourceForecast] | None = None
     _entering: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self) -> None:
@@ -93,11 +93,11 @@ class Worker:
         """The next sequence that may begin, in hand; None if there is none now."""
         now = datetime.now(UTC)
         due = [r for r in rows if r["state"] == "waiting" and (r["not_before"] or now) <= now]
-        planner, others, held_back = self._planner(), work_here(self.ledger.leases), 0
+        forecast, others, held_back = self._forecast(), work_here(self.ledger.leases), 0
         for row in sorted(due, key=lambda row: (-row["priority"], row["position"])):
             if held_back == MOST_HELD_BACK:
                 return None
-            prediction = planner.predict(Asked.model_validate_json(row["asked"]))
+            prediction = forecast.predict(Asked.model_validate_json(row["asked"]))
             budget = Budget.model_validate_json(row["budget"])
             if lacking := lacks_disk(self.ledger, budget, prediction.num_bytes or 0.0):
                 self._pause(lacking, sleeps=False)
@@ -129,7 +129,7 @@ class Worker:
         )
         self.say(f"{asked.scene_id}: begins, attempt {row['attempts'] + 1}")
         version = lidarpainter_models.__version__
-        effort = self._planner().effort(asked)
+        effort = self._forecast().effort(asked)
         is_first = row["cause"] is None  # else it may go on where another has stopped
         with beat, at_interruption(partial(self._end, beat, Ending(cause="interrupted"))):
             try:
@@ -177,11 +177,11 @@ class Worker:
             os._exit(ENDED_ITSELF)
         raise SystemExit
 
-    def _planner(self) -> Planner:
-        """The planner that goes by what is known now, or was a short while ago."""
+    def _forecast(self) -> ResourceForecast:
+        """The forecast that goes by what is known now, or was a short while ago."""
         now = time.monotonic()
         if self._plans is None or now - self._plans[0] > REPLAN_S:
-            self._plans = (now, Planner.of(self.ledger.store))
+            self._plans = (now, ResourceForecast.of(self.ledger.store))
         return self._plans[1]
 
     def _pause(self, why: str, *, sleeps: bool = True) -> None:

@@ -13,10 +13,10 @@ from catalog.fleets import FleetLedger, Wish
 from catalog.points import Point, points_of
 from catalog.store import Store
 from catalog.tables import Row
-from flows.fleet.asked import Asked, wishes
+from flows.fleet.asked_sequences import Asked, wishes
 from flows.fleet.local_workers import run_workers, starter
 from flows.fleet.manifest import Manifest
-from flows.fleet.planner import Planner
+from flows.fleet.resource_forecast import ResourceForecast
 from flows.fleet.status import counts_of
 from tasks.opened import open_scene
 
@@ -117,9 +117,10 @@ def _cost(store: Store, rows: Sequence[Row]) -> str:
 
 def _took(store: Store, asked: Sequence[tuple[str, int]]) -> str:
     """What sequences will take, each so many times, by what those of the store have taken."""
-    planner = Planner.of(store)
+    forecast = ResourceForecast.of(store)
     costs = [
-        (planner.predict(Asked.model_validate_json(one)).cpu_seconds, times) for one, times in asked
+        (forecast.predict(Asked.model_validate_json(one)).cpu_seconds, times)
+        for one, times in asked
     ]
     known = [(cost, times) for cost, times in costs if cost is not None]
     if not known:

@@ -24,7 +24,7 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.scenes.splits import evenly_taken

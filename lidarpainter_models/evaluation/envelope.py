@@ -29,7 +29,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.geometry.trajectory_words import ConstantStep
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
 from lidarpainter_models.scenes.records import RecordedView

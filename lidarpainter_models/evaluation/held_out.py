@@ -21,7 +21,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.records import ViewKey

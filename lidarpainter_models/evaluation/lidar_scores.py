@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.lidar_returns.channel import LidarChannel, SimulatedSweep
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.returns.channel import LidarChannel, SimulatedSweep
 from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_rays
 from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 from lidarpainter_models.scenes.categories import category_of

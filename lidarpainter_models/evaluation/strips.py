@@ -35,7 +35,7 @@ from lidarpainter_models.metrics.images import (
     psnr_from_error,
     squared_error,
 )
-from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.scenes.splits import ViewSplit, evenly_taken
 
 GROW_PX = 1

@@ -9,8 +9,8 @@ from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.export.formats import SWEEP_FORMATS
 from lidarpainter_models.export.lidar_files import WrittenSweep
+from lidarpainter_models.gaussians.lidar_returns.channel import LidarChannel, Returns
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.returns.channel import LidarChannel, Returns
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.firings import MountedLidar

@@ -25,7 +25,7 @@ from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, ins
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.scenes.records import RecordedView
 
 UNPAINTED_FOLDER = "unpainted"

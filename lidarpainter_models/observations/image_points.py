@@ -20,7 +20,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.colouring import BEAM_SPACING_RAD
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.own_body import on_grid
 from lidarpainter_models.observations.plane_sweep import sweep_cost, sweep_depths
 from lidarpainter_models.observations.settings import ObservationConfig

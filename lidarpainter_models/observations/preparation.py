@@ -25,8 +25,8 @@ from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.lidar.sweep_registration import register_sweeps
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.image_points import points_from_images
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.own_body import on_grid, own_bodies
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView

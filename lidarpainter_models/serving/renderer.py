@@ -22,14 +22,14 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.followed_paths import found_camera
 from lidarpainter_models.conditioning.view_evidence import EVIDENCE_WIDTH_PX, EvidenceGatherer
 from lidarpainter_models.evaluation.view_confidence import Calibration
+from lidarpainter_models.gaussians.lidar_returns.channel import LidarChannel
 from lidarpainter_models.gaussians.model.actors import PRESENCE_MARGIN_NS
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.rolling_shutter import body_rates
-from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
-from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, ViewKey

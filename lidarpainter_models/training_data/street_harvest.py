@@ -16,7 +16,7 @@ from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
-from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit, split_views

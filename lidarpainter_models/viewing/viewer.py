@@ -26,7 +26,7 @@ from lidarpainter_models.geometry.transforms import (
     rigid_from_rotation,
     rotation_from_quaternion,
 )
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes
 from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, Controls

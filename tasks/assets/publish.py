@@ -14,7 +14,7 @@ from catalog.artefacts import Workplace
 from lidarpainter_models.assets.extraction import AssetSource, write_assets
 from lidarpainter_models.assets.sighted_actors import RecordedLook, sighted_actors
 from lidarpainter_models.editing.worlds import EditedWorld
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.records import RecordedView

@@ -8,10 +8,10 @@ from typing import Any
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.lidar_returns.channel import LidarChannel, channel_from_arrays
+from lidarpainter_models.gaussians.lidar_returns.fitting import fit_lidar
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.returns.channel import LidarChannel, channel_from_arrays
-from lidarpainter_models.gaussians.returns.fitting import fit_lidar
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
 from lidarpainter_models.lidar.firings import MountedLidar, mounted_lidar
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors

@@ -8,8 +8,8 @@ from typing import Any
 from catalog.artefacts import ArtefactRef, Workplace
 from lidarpainter_models.evaluation.lidar_scores import LidarEvaluation
 from lidarpainter_models.evaluation.score_tables import LIDAR
+from lidarpainter_models.gaussians.lidar_returns.channel import LidarChannel
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.returns.channel import LidarChannel
 from tasks.evaluation.views import SCORES_FILE
 from tasks.json_files import write_json
 from tasks.lidar.channel import corrected_scene, lidar_of, load_channel, mounted

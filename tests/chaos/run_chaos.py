@@ -30,7 +30,7 @@ from stub_stages import make, stages_ledger, write_inputs  # noqa: E402
 from catalog.artefacts import ArtefactRef  # noqa: E402
 from catalog.digests import digest_file  # noqa: E402
 from catalog.store import open_store  # noqa: E402
-from flows.fleet.asked import wishes  # noqa: E402
+from flows.fleet.asked_sequences import wishes  # noqa: E402
 from flows.fleet.flow_runs import close_lost_runs  # noqa: E402
 from flows.fleet.manifest import read_manifest  # noqa: E402
 from flows.fleet.status import fleet_status  # noqa: E402

@@ -5,7 +5,7 @@ import torch
 from commands import call, refuse, succeed
 from tiny_street import SCENE, SETTINGS
 
-from flows.fleet.asked import Asked
+from flows.fleet.asked_sequences import Asked
 from flows.fleet.work import make_sequence
 from lidarpainter_models.assets.asset_files import read_asset
 from lidarpainter_models.serving.refusals import RequestError

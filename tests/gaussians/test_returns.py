@@ -10,14 +10,14 @@ from tiny_street import tiny_street
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.lidar_scores import LidarEvaluation, chamfer_m2
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
-from lidarpainter_models.gaussians.returns.channel import (
+from lidarpainter_models.gaussians.lidar_returns.channel import (
     channel_from_arrays,
     measured_ranges,
 )
-from lidarpainter_models.gaussians.returns.fitting import fit_lidar
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.fitting import fit_lidar
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.kernels.ray_gaussians import RayHits
 from lidarpainter_models.lidar.firings import mounted_lidar, recorded_rays
 from lidarpainter_models.scenes.driving_scene import DrivingScene

@@ -6,8 +6,8 @@ import pytest
 import torch
 from styled_world import place
 
+from lidarpainter_models.gaussians.lidar_returns.weather import SEEN_FROM_M, Air
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
-from lidarpainter_models.gaussians.returns.weather import SEEN_FROM_M, Air
 from lidarpainter_models.weather.mix import StyleMix
 from lidarpainter_models.weather.water import DROPS_RETURN_M
 

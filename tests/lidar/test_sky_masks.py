@@ -5,7 +5,7 @@ from toy_street import EYE, LOOK_FORWARD, SKY, ToyStreet
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.lidar.sky_masks import sky_from_returns, sky_mask
-from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.image_shrinking import shrink_image
 
 HEIGHT, WIDTH, HORIZON = 120, 200, 80
 

@@ -12,7 +12,7 @@ from lidarpainter_models.gaussians.initialisation.settings import Initialisation
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
-from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.stored_form import (

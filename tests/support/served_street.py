@@ -10,8 +10,8 @@ import lidarpainter_models as lp
 from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
-from lidarpainter_models.gaussians.returns.fitting import fit_lidar
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.fitting import fit_lidar
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.lidar.firings import mounted_lidar
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.serving import wire

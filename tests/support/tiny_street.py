@@ -4,7 +4,7 @@ from functools import partial
 
 from commands import settings, succeed
 
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 

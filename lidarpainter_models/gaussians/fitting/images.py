@@ -14,7 +14,7 @@ from lidarpainter_models.gaussians.model.sky import seen_as_sky
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.pixel_losses import NOTHING, OPEN, SKY, SOLID, PixelFacts
 from lidarpainter_models.kernels.sky_texture import SkyLayout
-from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.observations.views import TrainingView
 
 _BESIDE = np.ones((3, 3), np.uint8)

@@ -13,7 +13,7 @@ from torch import Tensor
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.tensor_files import check_header, fill_from_file
+from lidarpainter_models.painter.weight_reading import check_header, fill_from_file
 from lidarpainter_models.storage.tensor_files import open_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"

@@ -24,7 +24,7 @@ from lidarpainter_models.painter.one_step.architectures import (
 )
 from lidarpainter_models.painter.one_step.config import AutoencoderKind, OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
-from lidarpainter_models.painter.tensor_files import fill_from_file
+from lidarpainter_models.painter.weight_reading import fill_from_file
 
 SD_TURBO_HUB = "stabilityai/sd-turbo"
 TAESD_HUB = "madebyollin/taesd"

@@ -21,7 +21,7 @@ from lidarpainter_models.painter.one_step.assembly import (
 )
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
-from lidarpainter_models.painter.tensor_files import check_finite, check_header, check_shapes
+from lidarpainter_models.painter.weight_reading import check_finite, check_header, check_shapes
 from lidarpainter_models.storage.tensor_files import open_tensors, read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"

@@ -9,7 +9,7 @@ from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
 from catalog import buckets
 from catalog.buckets import Bucket
 from catalog.store import open_store
-from flows.fleet.asked import Asked, wishes
+from flows.fleet.asked_sequences import Asked, wishes
 from flows.fleet.limits import lacks_disk
 from flows.fleet.local_workers import run_workers
 from flows.fleet.manifest import Budget, read_manifest

@@ -9,7 +9,7 @@ from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
 from catalog.leases import FolderObjects, Leases
 from catalog.retries import attempt_id
 from flows.fleet import flow_runs as flow_runs_module
-from flows.fleet.asked import Asked, wishes
+from flows.fleet.asked_sequences import Asked, wishes
 from flows.fleet.flow_runs import (
     SEQUENCE,
     WORK,

@@ -5,7 +5,7 @@ import re
 import pytest
 from small_pandaset import PandasetFolder
 
-from flows.fleet.asked import Asked, wishes
+from flows.fleet.asked_sequences import Asked, wishes
 from flows.fleet.manifest import read_manifest
 from lidarpainter_models.errors import ConfigError, DataError, WeightsError
 

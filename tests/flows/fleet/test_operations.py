@@ -11,7 +11,7 @@ from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
 from catalog.records import metric_row
 from catalog.retries import Ending
 from catalog.store import open_store
-from flows.fleet.asked import wishes
+from flows.fleet.asked_sequences import wishes
 from flows.fleet.manifest import read_manifest
 from flows.fleet.report import fleet_page
 from flows.fleet.worker import EventLog

@@ -25,11 +25,11 @@ from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
 from catalog.retries import Ending
 from catalog.store import open_store
-from flows.fleet.asked import Asked, wishes
+from flows.fleet.asked_sequences import Asked, wishes
 from flows.fleet.error_causes import cause_of
 from flows.fleet.limits import admits
 from flows.fleet.manifest import Budget, read_manifest
-from flows.fleet.planner import Prediction
+from flows.fleet.resource_forecast import Prediction
 from flows.fleet.work import make_sequence
 from flows.fleet.worker import MOST_HELD_BACK, Worker
 from lidarpainter_models.errors import BackendError, SceneError, WriteError
@@ -213,8 +213,10 @@ def test_who_is_held_back_by_memory_takes_nothing_in_hand(store, tmp_path, monke
         seen.append((len(predicted), len(taken)))
         ledger.leases.give_back(other)
 
-    planner = SimpleNamespace(effort=lambda _: None, predict=predict)
-    monkeypatch.setattr("flows.fleet.worker.Planner", SimpleNamespace(of=lambda _: planner))
+    forecast = SimpleNamespace(effort=lambda _: None, predict=predict)
+    monkeypatch.setattr(
+        "flows.fleet.worker.ResourceForecast", SimpleNamespace(of=lambda _: forecast)
+    )
     monkeypatch.setattr("flows.fleet.worker.time.sleep", waits)
     monkeypatch.setattr(ledger, "take", lambda *given: taken.append(given) or take(*given))
     Worker(ledger=ledger, fleet="stub", work=stub_work, say=print).run()

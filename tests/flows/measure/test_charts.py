@@ -11,7 +11,7 @@ from toy_store import TOY_SCENE, write_toy_scene
 from catalog.errors import CatalogError, ConflictError
 from catalog.points import Point
 from catalog.store import open_store
-from flows.fleet.asked import wishes
+from flows.fleet.asked_sequences import wishes
 from flows.fleet.manifest import Manifest, Source
 from flows.measure.chart import chart_of, sizes_of
 from flows.measure.configurations import chart_ways, size_factors

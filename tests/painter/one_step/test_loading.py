@@ -254,7 +254,7 @@ LOADING = """
 import sys
 from pathlib import Path
 import torch
-from lidarpainter_models.painter import tensor_files
+from lidarpainter_models.painter import weight_reading
 from tasks.measuring import measured
 
 tensor_files.PORTION_NUMBERS = 1 << 22  # 16 MB of float32

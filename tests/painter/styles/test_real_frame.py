@@ -6,7 +6,7 @@ import torch
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.metrics.edges import edge_agreement
-from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.styles import StyleView, apply_style
 from lidarpainter_models.readers import ingest_scene

@@ -14,10 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
-from lidarpainter_models.gaussians.returns.channel import (
+from lidarpainter_models.gaussians.lidar_returns.channel import (
     NOISE_EDGES_M,
     Heads,
     LidarChannel,
@@ -25,8 +22,11 @@ from lidarpainter_models.gaussians.returns.channel import (
     in_bodies_of,
     thin_axes,
 )
-from lidarpainter_models.gaussians.returns.settings import LidarConfig
-from lidarpainter_models.gaussians.returns.surfels import surfels_of
+from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
+from lidarpainter_models.gaussians.lidar_returns.surfels import surfels_of
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
 from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_rays
 from lidarpainter_models.scenes.driving_scene import DrivingScene

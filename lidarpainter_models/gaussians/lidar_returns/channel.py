@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.lidar_returns.weather import Air
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import joined_gaussians
 from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
-from lidarpainter_models.gaussians.returns.weather import Air
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
 from lidarpainter_models.lidar.firings import SweepRays

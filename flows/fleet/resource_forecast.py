@@ -18,7 +18,7 @@ from typing import Any, Self
 
 from catalog.store import Store
 from catalog.tables import Row
-from flows.fleet.asked import Asked
+from flows.fleet.asked_sequences import Asked
 from flows.time_prediction import reference_seconds
 
 MOST_ATTEMPTS = 500
@@ -26,7 +26,7 @@ MOST_ATTEMPTS = 500
 HALF_LIFE = 10
 """Attempts after which one counts half as much."""
 RECENT = 10
-"""Attempts by which the ratio of wall to CPU time is known, and the error of the planner."""
+"""Attempts by which the ratio of wall to CPU time is known, and the error of the forecast."""
 READ_VIEW_S, DRAWN_PIXEL_S = 0.25, 2e-6
 """CPU seconds of reading a view of a dataset, and of drawing a pixel of a street."""
 PROCESS_BYTES, VIEW_BYTES = 0.8e9, 40.0
@@ -73,7 +73,7 @@ class Prediction:
         return {f"predicted_{name}": value for name, value in facts.items()}
 
 
-class Planner:
+class ResourceForecast:
     """Predicts from the attempts of one store."""
 
     def __init__(self, attempts: Sequence[Row], scenes: Sequence[Row]) -> None:
@@ -164,7 +164,7 @@ def own_cpu_seconds(attempt: Mapping[str, Any]) -> float:
     return (attempt["cpu_seconds"] or 0.0) - (attempt["compile_seconds"] or 0.0)
 
 
-def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
+def forecast_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
     """Return how far off the predicted CPU seconds were, as a share of the true ones.
 
     It is the median of the newest attempts that were predicted; those that were recalled or
