@@ -1,5 +1,7 @@
 """Draw what the LiDAR and the boxes say over what a camera saw: the quickest check of a scene."""
 
+from collections.abc import Collection, Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 _NEAREST_M, _FARTHEST_M = 3.0, 90.0
 _NEAR_PLANE_M = 0.3
 _LEGEND_PX, _LEGEND_WIDTH_PX, _RAMP_PX = 28, 700, 120
-_MOVING_RGB, _PARKED_RGB = (80, 255, 80), (255, 255, 255)
+_MOVING_RGB, _PARKED_RGB, PICKED_RGB = (80, 255, 80), (255, 255, 255), (255, 140, 0)
 
 
 def draw_overlay(scene: DrivingScene, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
@@ -55,12 +57,22 @@ def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "tall
 
 
 def draw_boxes(
-    image: np.ndarray, camera: Camera, tracks: tuple[ActorTrack, ...], timestamp_ns: int
+    image: np.ndarray,
+    camera: Camera,
+    tracks: Sequence[ActorTrack],
+    timestamp_ns: int,
+    picked: Collection[str] = (),
 ) -> None:
-    """Draw the actors that are there at a time over an image (height, width, 3; bytes)."""
+    """Draw the actors that are there at a time over an image (height, width, 3; bytes).
+
+    Those whose ids are picked are orange.
+    """
     for track in tracks:
         if track.is_present(timestamp_ns):
-            _draw_box(image, camera, track, timestamp_ns)
+            colour = _MOVING_RGB if track.is_moving else _PARKED_RGB
+            if track.actor_id in picked:
+                colour = PICKED_RGB
+            _draw_box(image, camera, track, timestamp_ns, colour)
 
 
 def _draw_points(image: np.ndarray, camera: Camera, xyz_m: Tensor) -> None:
@@ -76,11 +88,16 @@ def _draw_points(image: np.ndarray, camera: Camera, xyz_m: Tensor) -> None:
         cv2.circle(image, centre, radius_px, colours_bgr[row, ::-1].tolist(), thickness=-1)
 
 
-def _draw_box(image: np.ndarray, camera: Camera, track: ActorTrack, timestamp_ns: int) -> None:
+def _draw_box(
+    image: np.ndarray,
+    camera: Camera,
+    track: ActorTrack,
+    timestamp_ns: int,
+    colour: tuple[int, int, int],
+) -> None:
     world_from_box = track.pose_at(timestamp_ns)
     camera_from_box = invert_rigid(camera.world_from_camera) @ world_from_box
     corners = transform_points(camera_from_box, box_corners(track.size_m.double())).numpy()
-    colour = _MOVING_RGB if track.is_moving else _PARKED_RGB
     crossed = ((4, 7), (5, 6))  # the diagonals of the face at +x
     for first, second in (*BOX_EDGES, *crossed):
         _draw_line(image, camera, corners[first], corners[second], colour)

@@ -5,8 +5,9 @@ since the log began, lengths metres.
 """
 
 import json
+from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -26,7 +27,8 @@ from lidarpainter_models.weather.mix import StyleMix
 
 MOST_OPERATIONS = 10_000
 ASSET = "asset:"
-_Name = Annotated[str, Field(min_length=1, max_length=200)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Words = TypeVar("Words")
 _Seconds = Annotated[float, Field(ge=0, le=1e6)]
 _Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 
@@ -36,27 +38,29 @@ def _leads_somewhere(spec: str, *, max_shift_m: float | None = None) -> str:
     return spec
 
 
-_Way = Annotated[_Name, AfterValidator(_leads_somewhere)]
+_Way = Annotated[Name, AfterValidator(_leads_somewhere)]
 
 
-class _Words(BaseModel):
+class OperationWords(BaseModel):
+    """Fields of an operation: what is unknown, of another type or no number is refused."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
-class ActorSource(_Words):
+class ActorSource(OperationWords):
     """Whose Gaussians are put in: those of a run, of the library of assets, or of a file.
 
     The text `asset:ID` is short for one of the library.
     """
 
-    actor: _Name | None = None
-    run: _Name | None = None
+    actor: Name | None = None
+    run: Name | None = None
     """The run of that actor; the run that is edited if absent."""
-    asset: _Name | None = None
+    asset: Name | None = None
     """Id of an asset, or a unique prefix of one."""
-    store: _Name | None = None
+    store: Name | None = None
     """Folder of the store of that run or asset; this one if absent."""
-    ply: _Name | None = None
+    ply: Name | None = None
     """Gaussians of one car: x ahead, y left, z up; its box is found around them."""
 
     @model_validator(mode="before")
@@ -76,28 +80,28 @@ class ActorSource(_Words):
         return self
 
 
-class Remove(_Words):
+class Remove(OperationWords):
     """Take actors out."""
 
     op: Literal["remove"]
-    actors: Annotated[tuple[_Name, ...], Field(min_length=1, strict=False)]
+    actors: Annotated[tuple[Name, ...], Field(min_length=1, strict=False)]
 
 
-class Move(_Words):
+class Move(OperationWords):
     """Let an actor go elsewhere; `re-route` is another word for it."""
 
     op: Literal["move", "re-route"]
-    actor: _Name
+    actor: Name
     trajectory: _Way
     """Off its own path: see `geometry/trajectory_specs.py`."""
 
 
-class Insert(_Words):
+class Insert(OperationWords):
     """Put an actor in, before the ego or in another one's place."""
 
     op: Literal["insert"]
     source: ActorSource
-    name: _Name
+    name: Name
     """What it is called from then on."""
     ahead_m: _Metres = 15.0
     """How far ahead of the ego's place when the log begins, along its path."""
@@ -110,61 +114,61 @@ class Insert(_Words):
     """Off the path that these give."""
 
 
-class Swap(_Words):
+class Swap(OperationWords):
     """Put another actor in the place of one, on its path."""
 
     op: Literal["swap"]
-    actor: _Name
+    actor: Name
     source: ActorSource
 
 
-class Scale(_Words):
+class Scale(OperationWords):
     """Make an actor larger or smaller where it stands."""
 
     op: Literal["scale"]
-    actor: _Name
+    actor: Name
     factor: Annotated[float, Field(gt=0.05, lt=20)]
 
 
-class Retime(_Words):
+class Retime(OperationWords):
     """Let an actor drive its path later, faster or slower."""
 
     op: Literal["retime"]
-    actor: _Name
+    actor: Name
     delay_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     speed: Annotated[float, Field(gt=0.01, lt=100)] = 1.0
     """Times its own."""
 
 
-class Stop(_Words):
+class Stop(OperationWords):
     """Let an actor brake and stand from then on."""
 
     op: Literal["stop"]
-    actor: _Name
+    actor: Name
     at_s: _Seconds
     """When it begins to brake."""
     over_s: Annotated[float, Field(ge=0, le=1000)] = 1.0
 
 
-class Freeze(_Words):
+class Freeze(OperationWords):
     """Let everybody stand as they do at a time."""
 
     op: Literal["freeze"]
     at_s: _Seconds
 
 
-class Lamps(_Words):
+class Lamps(OperationWords):
     """Switch an actor's lamps at night, and let it brake; of a parked car they are off before."""
 
     op: Literal["lamps"]
-    actor: _Name
+    actor: Name
     state: LampState
     from_s: _Seconds = 0.0
     until_s: _Seconds | None = None
     """The end of the log if absent."""
 
 
-class Crop(_Words):
+class Crop(OperationWords):
     """Keep a stretch of road only, counted along the ego's path."""
 
     op: Literal["crop"]
@@ -178,28 +182,28 @@ class Crop(_Words):
         return self
 
 
-class Join(_Words):
+class Join(OperationWords):
     """Take from another run of the same place what it saw better."""
 
     op: Literal["join"]
-    run: _Name
+    run: Name
     """Fitted to the same sequence, or to one whose frame of reference is known to be the same."""
-    store: _Name | None = None
+    store: Name | None = None
     """Folder of its store; this one if absent."""
 
 
-class Drive(_Words):
+class Drive(OperationWords):
     """Where the camera goes when the edited run is shown with the script; changes no scene."""
 
     op: Literal["drive"]
-    trajectory: Annotated[_Name, AfterValidator(partial(_leads_somewhere, max_shift_m=MAX_SHIFT_M))]
+    trajectory: Annotated[Name, AfterValidator(partial(_leads_somewhere, max_shift_m=MAX_SHIFT_M))]
 
 
-class Style(_Words):
+class Style(OperationWords):
     """Put the edited scene into fog, night or rain; the last one holds."""
 
     op: Literal["style"]
-    prompt: _Name
+    prompt: Name
     """Such as `foggy:0.5+night`: see `weather/mix.py`."""
     strength: Annotated[float, Field(ge=0, le=1)] = 1.0
     visibility_m: Annotated[float, Field(gt=0, le=1e5)] | None = None
@@ -243,15 +247,7 @@ def parse_operations(found: Any, where: str) -> tuple[Operation, ...]:  # noqa: 
     Raises:
         ConfigError: it is no such list; the message says which operation, which field, and why.
     """
-    try:
-        operations = _SCRIPT.validate_python(found)
-    except ValidationError as error:
-        first = error.errors()[0]
-        number, *fields = [*first["loc"], ""][:-1] or [""]
-        place = ".".join(str(part) for part in fields[1:] or fields)
-        message = first["msg"].removeprefix("Value error, ")
-        step = f" operation {number + 1}" if isinstance(number, int) else ""
-        raise ConfigError(f"{where}{step}{f', {place}' if place else ''}: {message}") from None
+    operations = parsed_list(_SCRIPT.validate_python, found, where)
     if not operations:
         raise ConfigError(f"{where}: expected at least one operation")
     return operations
@@ -263,13 +259,39 @@ def parse_script(text: str, where: str) -> tuple[Operation, ...]:
     Raises:
         ConfigError: it is no JSON, or no such list.
     """
+    return parse_operations(json_list(text, where), where)
+
+
+def parsed_list(parse: Callable[[Any], Words], found: Any, where: str) -> Words:  # noqa: ANN401
+    """Operations of a script, as a function of pydantic reads them.
+
+    Raises:
+        ConfigError: it cannot; the message says which operation, which field, and why.
+    """
+    try:
+        return parse(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        number, *fields = [*first["loc"], ""][:-1] or [""]
+        place = ".".join(str(part) for part in fields[1:] or fields)
+        message = first["msg"].removeprefix("Value error, ")
+        step = f" operation {number + 1}" if isinstance(number, int) else ""
+        raise ConfigError(f"{where}{step}{f', {place}' if place else ''}: {message}") from None
+
+
+def json_list(text: str, where: str) -> list[Any]:
+    """The list that a JSON text holds.
+
+    Raises:
+        ConfigError: it is no JSON, or no list.
+    """
     try:
         found = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{where} is no JSON list of operations: {error}") from None
     if not isinstance(found, list):
         raise ConfigError(f"{where}: expected a JSON list of operations")
-    return parse_operations(found, where)
+    return found
 
 
 def _refuse_constant(name: str) -> float:

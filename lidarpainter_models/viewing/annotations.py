@@ -5,6 +5,7 @@ All nodes stand in the world frame below their roots; each kind can be hidden as
 
 import colorsys
 import math
+import re
 from collections.abc import Sequence
 
 import cv2
@@ -38,7 +39,7 @@ class TrackNodes:
             api.add_line_segments(
                 f"{root}/boxes/{node_name(index, track)}",
                 points=box_corners(track.size_m)[np.array(BOX_EDGES)].numpy(),
-                colors=_colour(index),
+                colors=colour_of(index),
                 thickness=LINE_PX,
                 thickness_units="screen",
             )
@@ -51,7 +52,7 @@ class TrackNodes:
                 api.add_line_segments(
                     f"{root}/tracks/{node_name(index, track)}",
                     points=np.stack([centres[:-1], centres[1:]], axis=1),
-                    colors=_colour(index),
+                    colors=colour_of(index),
                     thickness=LINE_PX,
                     thickness_units="screen",
                 )
@@ -117,6 +118,11 @@ def vertical_fov_rad(camera: Camera) -> float:
     return 2 * math.atan(camera.height_px / 2 / camera.fy_px)
 
 
-def _colour(index: int) -> tuple[float, float, float]:
+def plain(name: str) -> str:
+    """A dataset's name without what Markdown and HTML would make something of."""
+    return re.sub(r"[^\w .:-]+", " ", name)
+
+
+def colour_of(index: int) -> tuple[float, float, float]:
     """Colours far apart for neighbouring numbers."""
     return colorsys.hsv_to_rgb(index * _GOLDEN_ANGLE % 1, 0.7, 1.0)

@@ -5,7 +5,6 @@ under one lock.
 """
 
 import math
-import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -28,7 +27,7 @@ from lidarpainter_models.geometry.transforms import (
 )
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.scenes.tracks import ActorTrack
-from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes
+from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes, plain
 from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, Controls
 from lidarpainter_models.viewing.drive_nodes import (
     ROOT,
@@ -220,14 +219,9 @@ class LiveViewer:
 def _in_words(track: ActorTrack) -> str:
     length_m, width_m, height_m = track.size_m.tolist()
     return (
-        f"**{_plain(track.category)}**, id `{_plain(track.actor_id)}`, {length_m:.1f} m long, "
+        f"**{plain(track.category)}**, id `{plain(track.actor_id)}`, {length_m:.1f} m long, "
         f"{width_m:.1f} m wide, {height_m:.1f} m high"
     )
-
-
-def _plain(name: str) -> str:
-    """A dataset's name without what Markdown and HTML would make something of."""
-    return re.sub(r"[^\w .:-]+", " ", name)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """Find who moves in a scene, and bring the scene with their boxes into the store."""
 
 import json
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 
 from catalog.artefacts import Workplace
 from catalog.store import Store, open_store
+from lidarpainter_models.editing.track_edits import edited_tracks, read_track_edits
 from lidarpainter_models.lidar.movers import FoundActor, box_of, find_movers, unboxed
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.frame_content import FrameContent
@@ -34,6 +36,7 @@ STAGE = "label"
 KIND = "labels"
 FILE = "labels.json"
 SUFFIX = "-labelled"
+EDITED_SUFFIX = "-edited"
 
 
 @stage_task
@@ -88,23 +91,98 @@ def ingest_labelled(
     store = open_store(store_path)
     scene = open_posed(store, scene_id)
     name = sequence or scene.sequence + SUFFIX
-    require_free(store, scene, name, STAGE)
     actors = _named(unboxed(load_actors(store, found), scene.tracks), scene.tracks)
     tracks = [actor.track for actor in actors]
-    entries = {key: scene.manifest[key] for key in FURTHER_ENTRIES if key in scene.manifest}
     scores = {actor.track.actor_id: actor.score for actor in actors}
-    header = header_of(scene, {**entries, LABELLED: {**entries.get(LABELLED, {}), **scores}})
 
     def completed(frame: FrameContent) -> FrameContent:
         return replace(frame, boxes=[*frame.boxes, *track_boxes(tracks, frame.frame_index)])
 
-    told = {"from": scene_id, "digest": scene.content_digest, "artefact": found.ref.artefact_id}
+    scores = {**scene.manifest.get(LABELLED, {}), **scores}
+    told = {"artefact": found.ref.artefact_id}
+    return _with_boxes(store, scene, name, completed, scores, told)
+
+
+@stage_task
+def ingest_edited(
+    store_path: Path, scene_id: str, edits: Path, sequence: str | None
+) -> dict[str, Any]:
+    """Write a scene with its boxes as a person changed them; returns its row in `scenes`.
+
+    Args:
+        store_path: where both scenes are.
+        scene_id: whose boxes are changed.
+        edits: the file that `view --label` wrote.
+        sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
+
+    Raises:
+        ConfigError: the edits are of other boxes, or a scene of that name was made otherwise.
+    """
+    store = open_store(store_path)
+    scene = open_posed(store, scene_id)
+    tracks = edited_tracks(scene.tracks, read_track_edits(edits))
+    name = sequence or scene.sequence + EDITED_SUFFIX
+    ids = {track.actor_id for track in tracks}
+    scores = {name: one for name, one in scene.manifest.get(LABELLED, {}).items() if name in ids}
+
+    def edited(frame: FrameContent) -> FrameContent:
+        return replace(frame, boxes=track_boxes(tracks, frame.frame_index))
+
+    return _with_boxes(store, scene, name, edited, scores, {"edits": read_json(edits)})
+
+
+def _with_boxes(
+    store: Store,
+    scene: DrivingScene,
+    name: str,
+    change: Callable[[FrameContent], FrameContent],
+    scores: Mapping[str, float],
+    told: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Write a scene under another name, with other boxes; returns its row in `scenes`.
+
+    `scores` are those of boxes that were found, `told` is how the boxes came to be.
+    """
+    require_free(store, scene, name, STAGE)
+    entries = {key: scene.manifest[key] for key in FURTHER_ENTRIES if key in scene.manifest}
+    header = header_of(scene, {**entries, LABELLED: dict(scores)} if scores else entries)
+    made_from = {"from": f"{scene.dataset}/{scene.sequence}", "digest": scene.content_digest}
     with writing(store, f"{scene.dataset}/{name}"):
         path = write_anew(
-            *(scene, store.root, name, header, completed, {STAGE: told}),
+            *(scene, store.root, name, header, change, {STAGE: {**made_from, **told}}),
             progress=lambda done, total: listener().advanced(WRITE, done, total, ""),
         )
     return record_scene(store, path)
+
+
+def label_by_hand(
+    store: Store,
+    scene_id: str,
+    edits: Path,
+    *,
+    port: int | None,
+    opened_at: Callable[[str], None],
+    stopped: threading.Event,
+) -> None:
+    """Show a scene's boxes in a browser until stopped, and write what is changed about them.
+
+    Args:
+        store: where the scene is.
+        scene_id: whose boxes are shown.
+        edits: the file that is written, and read first where it is there.
+        port: where to listen; None takes a free one.
+        opened_at: told the address.
+        stopped: ends the viewer when it is set.
+
+    Raises:
+        ConfigError: the port cannot be had, or the file holds edits of other boxes.
+    """
+    from lidarpainter_models.viewing.label_viewer import LabelSession, label_viewer
+
+    session = LabelSession(open_posed(store, scene_id), edits)
+    with label_viewer(session, port=port) as address:
+        opened_at(address)
+        stopped.wait()
 
 
 def load_actors(store: Store, found: StageResult) -> list[FoundActor]:

@@ -1,5 +1,8 @@
 """A log that says neither where the car drove nor who is where: `localise`, `label`."""
 
+import json
+from unittest.mock import Mock
+
 import pytest
 from commands import call, refuse, succeed
 from tiny_street import TINY, tiny_street
@@ -81,6 +84,39 @@ def test_poses_and_boxes_that_are_there_are_judged_and_kept(store):
     kept = {track.actor_id for track in before.tracks}
     assert kept <= {track.actor_id for track in after.tracks}
     assert after.manifest["generator"] == before.manifest["generator"]
+
+
+def test_boxes_that_a_person_changed_are_written_as_they_were_changed(store, tmp_path, monkeypatch):
+    first, second, *others = (track.actor_id for track in scene_of(store, STREET).tracks)
+    edits, visited = tmp_path / "edits.json", []
+    changes = [
+        {"op": "delete", "actors": [first]},
+        {"op": "rename", "actor": second, "name": "bus-1", "category": "bus"},
+    ]
+    edits.write_text(json.dumps(changes))
+    monkeypatch.setattr("flows.cli.view.threading", Mock())  # else it shows until Ctrl-C
+    monkeypatch.setattr("webbrowser.open", visited.append)
+    shown = succeed("view", STREET, "--label", "--edits", edits, store=store)
+    assert shown.out.splitlines() == visited
+    told = succeed("label", STREET, "--edits", edits, "--json", store=store).json
+    assert told == {"scene": STREET, "written": f"{STREET}-edited"}
+    after = scene_of(store, told["written"])
+    assert {track.actor_id for track in after.tracks} == {"bus-1", *others}
+    assert {track.actor_id: track.category for track in after.tracks}["bus-1"] == "bus"
+    assert after.manifest["provenance"]["label"]["edits"] == changes
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("view", STREET, "--label", "--camera", "front"), "--label has no use for --camera"),
+        (("view", STREET, "--edits", "a.json"), "view of a run has no use for --edits"),
+        (("label", STREET, "--edits", "missing.json"), "missing.json cannot be read"),
+        (("label", STREET, "--edits", "a.json", "--complete"), "--edits has no use for --complete"),
+    ],
+)
+def test_options_that_mean_nothing_there_are_refused(store, words, expected):
+    assert expected in refuse(*words, store=store)
 
 
 def test_a_scene_of_another_origin_is_not_replaced(store):

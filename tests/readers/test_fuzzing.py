@@ -70,6 +70,6 @@ def test_damaged_log_is_refused_or_sound(log, tmp_path):
 @pytest.mark.slow
 def test_damaged_logs_of_the_day(log, tmp_path):
     """Others every day, so that a month of nights tries 24,000; a failure tells its seed."""
-    first = NUM_NIGHT * date.today().toordinal()  # noqa: DTZ011
+    first = NUM_NIGHT * date.today().toordinal()
     outcomes = fuzzed(log, tmp_path, range(first, first + NUM_NIGHT))
     assert outcomes["refused"] + outcomes["accepted"] == NUM_NIGHT
