@@ -12,6 +12,7 @@ Camera frames: x right, y down, z forward.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Any
 
 import cv2
@@ -64,11 +65,14 @@ class Face:
     """The part of the image that it has pixels in."""
     is_own: np.ndarray
     """Which pixels of that part are its own."""
-    places: tuple[np.ndarray, np.ndarray]
-    """Where in the face the pixels of the part are sampled, as OpenCV counts pixels."""
+    places: Float[np.ndarray, "rows columns 2"]
+    """Where in the face the middles of the part's pixels lie, in pixels of the pinhole."""
+    steps: Float[np.ndarray, "2 rows columns 2"]
+    """From there to the next column and to the next row."""
     times: int
     """How many pixels are drawn for one of the pinhole, along one axis: Gaussians are made for the
-    pixels that they were fitted to, in coarser ones thin things are too wide."""
+    pixels that they were fitted to, in coarser ones thin things are too wide. A pixel of the lens
+    is the mean over as many rays along either axis."""
 
     def at(self, world_from_camera: Float[Tensor, "4 4"]) -> Camera:
         """The face as a camera of the world, as fine as it is drawn."""
@@ -77,6 +81,24 @@ class Face:
             height_px=self.times * self.pinhole.height_px,
         )
         return fine.at(world_from_camera @ self.camera_from_face)
+
+    def sampled(
+        self, drawn: Float[np.ndarray, "face_height face_width 3"]
+    ) -> Float[np.ndarray, "rows columns 3"]:
+        """The part of the lens' image that an image of the face gives, as fine as it is drawn.
+
+        One ray a pixel looks between pixels by a cubic; of several rays each looks between the four
+        that are nearest, for their mean is what counts.
+        """
+        between = cv2.INTER_CUBIC if self.times == 1 else cv2.INTER_LINEAR
+        aside = (np.arange(self.times, dtype=np.float32) + 0.5) / self.times - 0.5
+        found = np.zeros((*self.is_own.shape, 3), np.float32)
+        for across, down in product(aside, aside):
+            at = self.places + across * self.steps[0] + down * self.steps[1]
+            # OpenCV counts from the middle of a pixel
+            column, row = cv2.split(self.times * at - np.float32(0.5))
+            found += cv2.remap(drawn, column, row, between, borderMode=cv2.BORDER_REPLICATE)
+        return found / self.times**2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,14 +145,7 @@ class LensImage:
         """The image, by what a function draws of each face; black where the lens sees nothing."""
         image = np.zeros((*self.is_seen.shape, 3), np.float32)
         for face in self.faces:
-            fine = draw(face).cpu().permute(2, 0, 1)[None]
-            drawn = torch.nn.functional.avg_pool2d(fine, face.times)[0].permute(1, 2, 0)
-            sampled = cv2.remap(
-                np.ascontiguousarray(drawn.numpy()),
-                *face.places,
-                cv2.INTER_CUBIC,
-                borderMode=cv2.BORDER_REPLICATE,
-            )
+            sampled = face.sampled(draw(face).cpu().contiguous().numpy())
             image[face.rows, face.columns][face.is_own] = sampled[face.is_own]
         return torch.from_numpy(image)
 
@@ -199,7 +214,7 @@ class _Part:
         rows, columns = (_reach(self.own.any(dim=axis)) for axis in (1, 0))
         part = self.own[rows, columns]
         places = torch.zeros(*part.shape, 2, dtype=torch.float32)
-        places[part] = (met - met.new_tensor(low) - 0.5).float()
+        places[part] = (met - met.new_tensor(low)).float()
         return Face(
             name=self.name,
             camera_from_face=pose,
@@ -207,7 +222,8 @@ class _Part:
             rows=rows,
             columns=columns,
             is_own=part.numpy(),
-            places=(places[..., 0].contiguous().numpy(), places[..., 1].contiguous().numpy()),
+            places=places.numpy(),
+            steps=torch.stack([_steps(places, part, axis) for axis in (1, 0)]).numpy(),
             times=min(max(round(fitted_px / focal_px), 1), MOST_TIMES),
         )
 
@@ -223,6 +239,23 @@ def _finest_step(met: Float[Tensor, "height width 2"], own: Bool[Tensor, "height
     if not len(found):
         return 1.0
     return float(found.kthvalue(1 + len(found) // 100).values.clamp(min=1e-6))
+
+
+def _steps(
+    places: Float[Tensor, "rows columns 2"], is_own: Bool[Tensor, "rows columns"], axis: int
+) -> Float[Tensor, "rows columns 2"]:
+    """Between the places of neighbours along an axis: the mean of both sides, where both are own.
+
+    A pixel without an own neighbour there has a step of nothing.
+    """
+    count = is_own.shape[axis] - 1
+    both = is_own.narrow(axis, 1, count) & is_own.narrow(axis, 0, count)
+    step = torch.where(both[..., None], places.diff(dim=axis), 0.0)
+    total, sides = torch.zeros_like(places), torch.zeros_like(places[..., :1])
+    for start in (0, 1):
+        total.narrow(axis, start, count).add_(step)
+        sides.narrow(axis, start, count).add_(both[..., None])
+    return total / sides.clamp(min=1)
 
 
 def _reach(is_there: Bool[Tensor, " places"]) -> slice:
