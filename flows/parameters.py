@@ -95,6 +95,8 @@ class ReconstructParameters(ViewParameters):
     """Write the page about the run."""
     judge_lidar: bool = False
     """Also judge simulated sweeps of the first LiDAR by those held out, which is learnt for it."""
+    judge_markings: bool = False
+    """Also judge the painted lines that the final scene shows, on its path and beside it."""
     judge_view_time: bool = False
     """Also judge what the final scene shows when it is painted at view time."""
 
@@ -109,10 +111,11 @@ class ReconstructParameters(ViewParameters):
         ]
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
-        swept = ["lidar", "evaluate-lidar"] if self.judge_lidar else []
+        more = ["lidar", "evaluate-lidar"] if self.judge_lidar else []
+        more += ["evaluate-markings"] if self.judge_markings else []
         first = ["examine"] if self.examines else []
         last = ["report"] if self.report else []
-        after = [*first, *([*judged, "envelope", *swept] if self.judge else []), *last]
+        after = [*first, *([*judged, "envelope", *more] if self.judge else []), *last]
         return ("prepare", "fit", *rounds, *after)
 
     @property

@@ -14,7 +14,7 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, early_end_recorded, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.score_tables import LIDAR, Scores, fitted_on
+from lidarpainter_models.evaluation.score_tables import LIDAR, MARKINGS, Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.metrics.perceptual import load_distances
@@ -22,7 +22,7 @@ from lidarpainter_models.observations.image_shrinking import require_recorded_wi
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope
-from tasks.evaluation.views import evaluate, load_scores
+from tasks.evaluation.views import evaluate, evaluate_markings, load_scores
 from tasks.lidar.channel import learn_lidar
 from tasks.lidar.evaluate import evaluate_lidar
 from tasks.opened import opened
@@ -215,6 +215,10 @@ def _judged(
     if course.parameters.judge_lidar:
         learnt = course.add(LIDAR, learn_lidar(course.run, final, LidarConfig()))
         told = course.add(f"evaluate-{LIDAR}", evaluate_lidar(course.run, final, learnt.ref))
+        scores["painted"] |= load_scores(store, told.ref)
+    if course.parameters.judge_markings:
+        name, config = f"evaluate-{MARKINGS}", course.parameters.evaluation_config
+        told = course.add(name, evaluate_markings(course.run, name, final, config))
         scores["painted"] |= load_scores(store, told.ref)
     return scores
 

@@ -11,7 +11,7 @@ from flows.measure.figures import COSTS, LABELS, QUALITIES, Group, groups_of
 from lidarpainter_models.evaluation.fronts import Spread, beats, knee, paired_gain, pareto_front
 from lidarpainter_models.export.charts import Chart, Mark, draw_chart, write_chart_page
 
-DRAWN = ("recorded_psnr", "aside_psnr", "aside_depth", "lidar_within")
+DRAWN = ("recorded_psnr", "aside_psnr", "aside_depth", "lidar_within", "markings_auc")
 """Rows of panels; more of each is better."""
 TIME = "cpu_seconds"
 

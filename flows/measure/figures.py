@@ -8,7 +8,7 @@ from typing import Literal
 from catalog.points import MetricName, Point
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.fronts import Spread
-from lidarpainter_models.evaluation.score_tables import DEPTH, LIDAR
+from lidarpainter_models.evaluation.score_tables import DEPTH, LIDAR, MARKINGS
 
 LANES = ("left-2m", "right-2m", "left-3m", "right-3m")
 """The paper's shifts to the sides."""
@@ -23,6 +23,7 @@ QUALITIES: dict[str, tuple[MetricName, ...]] = {
     "aside_depth": tuple(("depth", lane, DEPTH) for lane in LANES),
     "lidar_within": ((LIDAR, "own", "within_10_cm"),),
     "lidar_drop": ((LIDAR, "neurad-studio", "ray_drop_accuracy"),),
+    "markings_auc": tuple((MARKINGS, lane, "auc") for lane in LANES),
 }
 """The numbers that each is the mean of; where one is missing it is not known."""
 LABELS = {
@@ -36,6 +37,7 @@ LABELS = {
     "aside_depth": "LiDAR met within 5 %, 2 and 3 m aside",
     "lidar_within": "simulated ranges within 10 cm of held-out sweeps",
     "lidar_drop": "rays told right to come back or not",
+    "markings_auc": "painted lines told from road (AUC), 2 and 3 m aside",
     "cpu_seconds": "CPU time to make the scene, s",
     "seconds": "wall time to make the scene, s",
     "peak_memory_bytes": "peak memory, bytes",
@@ -58,6 +60,7 @@ FORMATS = {
     "depth": SHARE,
     "depth_within_5_percent": SHARE,
     "lpips": SHARE,
+    "auc": SHARE,
     "feature_distance": ".2f",
     "cpu_seconds": ".0f",
     "seconds": ".0f",

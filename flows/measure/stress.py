@@ -21,7 +21,7 @@ PAINTED, UNPAINTED = "painted", "unpainted"
 WAYS = (Configuration(name=PAINTED), Configuration(name=UNPAINTED, painter="none"))
 """The unpainted scene is fitted as long."""
 PUBLISHED: tuple[Publication, ...] = ("scores", "examination")
-QUALITIES = ("aside_psnr", "recorded_psnr", "lidar_within")
+QUALITIES = ("aside_psnr", "recorded_psnr", "lidar_within", "markings_auc")
 _NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 _Trials = Mapping[int, Mapping[str, float]]
 """Figures by seed."""

@@ -51,8 +51,9 @@ def metric_values(
         for name, value in _numbers(values):
             place = (_truth_of(name), trajectory, name)
             found.append((*place, value, _reason(values, name, value)))
-    swept = _by_part({LIDAR: scores[LIDAR]}) if LIDAR in scores else []
-    return [*found, *_trusted(scores.get(ENVELOPE)), *swept]
+    more = [name for name in (LIDAR, MARKINGS) if name in scores]
+    further = [row for name in more for row in _by_part({name: scores[name]})]
+    return [*found, *_trusted(scores.get(ENVELOPE)), *further]
 
 
 def _truth_of(name: str) -> str:

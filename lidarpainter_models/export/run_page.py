@@ -9,6 +9,7 @@ from typing import Any
 from lidarpainter_models.evaluation.score_tables import (
     ENVELOPE,
     LIDAR,
+    MARKINGS,
     SCORE_NOTE,
     TRUSTED,
     score_columns,
@@ -166,6 +167,8 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
             [name, f"{value:.4g}"] for name, value in named.items() if value is not None
         ]
         tables.append(Table(title=title, columns=["figure", "value"], rows=figures))
+    if lines := result.get(MARKINGS):
+        tables.append(_markings(lines))
     if envelope := result.get(ENVELOPE):
         tables.append(_envelope(envelope))
     tables.append(
@@ -192,6 +195,27 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
             )
         )
     return tables
+
+
+def _markings(lines: Mapping[str, Mapping[str, Any]]) -> Table:
+    """How well painted lines are told from the road, where the camera was and beside it."""
+    named = ("auc", "confirmed_auc", "paint_psnr", "paint_edge_error")
+    shown = [name for name in named if any(one.get(name) is not None for one in lines.values())]
+    words = {
+        "auc": "brighter than the road, AUC",
+        "confirmed_auc": "... where LiDAR confirms paint, AUC",
+        "paint_psnr": "pixels of lines, PSNR in dB",
+        "paint_edge_error": "edges of lines, error",
+    }
+    told_by = next(iter(lines.values()))["told_by"]
+    return Table(
+        title="Painted lines",
+        columns=["view", *(words[name] for name in shown)],
+        rows=[[view, *(one.get(name) for name in shown)] for view, one in lines.items()],
+        note=f"Where lines are is told by the LiDAR's {told_by}. AUC: 1 where every point of paint "
+        "is brighter than the road around it, 0.5 where no line is to be seen; `image` is what was "
+        "recorded. Higher is better, but for edges.",
+    )
 
 
 def _envelope(envelope: Mapping[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""Simulated sweeps of a run: judged, written, and the sensor of its log."""
+"""Simulated sweeps and painted lines of a run: judged, written; the sensor of its log."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from pyarrow import parquet
 from tiny_street import QUICK_LIDAR, SCENE, reconstructed
 
 from flows import lidar, reconstruct
-from flows.measure.figures import qualities
+from flows.measure.figures import LANES, qualities
 
 COLUMNS = {"x", "y", "z", "intensity", "ring", "return", "timestamp_ns", "actor"}
 
@@ -47,6 +47,23 @@ def test_a_run_judges_its_sweeps_at_once_where_that_is_asked_for(tiny_run, monke
         if row["run_id"] == result["run_id"] and row["value"] is not None
     }
     assert qualities(found)["lidar_within"] == pytest.approx(within)
+
+
+def test_a_run_judges_its_painted_lines_at_once_where_that_is_asked_for(tiny_run):
+    result = reconstructed(tiny_run, "--set", "judge_markings=true", "--json").json
+    lines = result["markings"]
+    assert {"image", "recorded", "left-2m"} <= set(lines)
+    page = Path(result["report"]).read_text("utf-8")
+    assert "Painted lines" in page
+    assert "told by the LiDAR" in page
+    found = {
+        (row["protocol"], row["trajectory"], row["name"]): row["value"]
+        for row in tiny_run.store.tables.rows("metrics")
+        if row["run_id"] == result["run_id"] and row["value"] is not None
+    }
+    assert found["markings", "recorded", "paint_psnr"] == lines["recorded"]["paint_psnr"]
+    entered = {("markings", lane, "auc"): 0.25 * place for place, lane in enumerate(LANES)}
+    assert qualities(entered)["markings_auc"] == pytest.approx(0.375)
 
 
 def test_sweeps_of_another_sensor_are_written_beside_the_path(tiny_run, tmp_path):
