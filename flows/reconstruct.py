@@ -14,6 +14,7 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, early_end_recorded, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.markings import views_ahead
 from lidarpainter_models.evaluation.score_tables import LIDAR, MARKINGS, Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
@@ -109,8 +110,8 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     Raises:
         SceneError: the scene is not there, or lacks a camera.
         ConfigError: the split leaves nothing to train on, images are wanted wider than recorded,
-            the device is not there, a fit weighs a distance without weights, or a round paints
-            too far away.
+            painted lines are to be judged and no held-out view looks ahead, the device is not
+            there, a fit weighs a distance without weights, or a round paints too far away.
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     run = opened(parameters.run_spec(store_path))
@@ -119,6 +120,8 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     width_px = parameters.observation.width_px
     if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
         require_recorded_width(width_px, run.views.train, "observation.width_px")
+    if parameters.judge and parameters.judge_markings:
+        views_ahead(run.scene, run.views.test)
     run.painter.load(run.device)
     load_distances(parameters.feature_weights, parameters.lpips, inception=parameters.inception)
     missing = parameters.lpips.missing

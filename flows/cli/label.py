@@ -24,7 +24,8 @@ COLUMNS = {
 }
 
 WORDS = """
-name: Name of the new scene in its dataset; its own and "-labelled" if absent.
+name: Name of the new scene in its dataset; its own and "-labelled" if absent, with --edits its
+  own and "-edited".
 complete: Write a scene that has boxes anew, with those of whoever moves and has none.
 edits: File of edits that `view SCENE --label` wrote; the scene is written anew with its boxes so
   changed, and nobody is sought.
@@ -47,6 +48,8 @@ def label(
 
     Example: lidarpainter label mcap/drive-localised
     """
+    if edits is not None:
+        refuse_unused("--edits", {"--complete": complete})
     say_status(f"opening {scene}")
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
@@ -56,7 +59,6 @@ def label(
 
     store = existing_store()
     if edits is not None:
-        refuse_unused("--edits", {"--complete": complete})
         _write_edited(store, scene, edits, name, as_json=as_json)
         return
     is_new = complete or name is not None or not open_posed(store, scene).tracks

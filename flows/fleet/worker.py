@@ -34,7 +34,7 @@ from tasks.progress import ProgressListener, subject, working_on
 
 Event = Literal["said", "stage-began", "stage-waits", "stage-ended"]
 POLL_S = 2.0
-REPLAN_S = 30.0
+FORECAST_EVERY_S = 30.0
 """How long the forecast goes by what it read last."""
 MOST_HELD_BACK = 8
 """Sequences for which there is no memory now, before no further ones are looked at."""
@@ -52,7 +52,7 @@ class Worker:
     say: Callable[[str], None]
     poll_s: float = POLL_S
     _told: str = ""
-    _plans: tuple[float, ResourceForecast] | None = None
+    _known_forecast: tuple[float, ResourceForecast] | None = None
     _entering: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self) -> None:
@@ -180,9 +180,9 @@ class Worker:
     def _forecast(self) -> ResourceForecast:
         """The forecast that goes by what is known now, or was a short while ago."""
         now = time.monotonic()
-        if self._plans is None or now - self._plans[0] > REPLAN_S:
-            self._plans = (now, ResourceForecast.of(self.ledger.store))
-        return self._plans[1]
+        if self._known_forecast is None or now - self._known_forecast[0] > FORECAST_EVERY_S:
+            self._known_forecast = (now, ResourceForecast.of(self.ledger.store))
+        return self._known_forecast[1]
 
     def _pause(self, why: str, *, sleeps: bool = True) -> None:
         if why != self._told:

@@ -247,7 +247,7 @@ def parse_operations(found: Any, where: str) -> tuple[Operation, ...]:  # noqa: 
     Raises:
         ConfigError: it is no such list; the message says which operation, which field, and why.
     """
-    operations = parsed_list(_SCRIPT.validate_python, found, where)
+    operations = parsed(_SCRIPT.validate_python, found, where)
     if not operations:
         raise ConfigError(f"{where}: expected at least one operation")
     return operations
@@ -259,39 +259,35 @@ def parse_script(text: str, where: str) -> tuple[Operation, ...]:
     Raises:
         ConfigError: it is no JSON, or no such list.
     """
-    return parse_operations(json_list(text, where), where)
-
-
-def parsed_list(parse: Callable[[Any], Words], found: Any, where: str) -> Words:  # noqa: ANN401
-    """Operations of a script, as a function of pydantic reads them.
-
-    Raises:
-        ConfigError: it cannot; the message says which operation, which field, and why.
-    """
-    try:
-        return parse(found)
-    except ValidationError as error:
-        first = error.errors()[0]
-        number, *fields = [*first["loc"], ""][:-1] or [""]
-        place = ".".join(str(part) for part in fields[1:] or fields)
-        message = first["msg"].removeprefix("Value error, ")
-        step = f" operation {number + 1}" if isinstance(number, int) else ""
-        raise ConfigError(f"{where}{step}{f', {place}' if place else ''}: {message}") from None
-
-
-def json_list(text: str, where: str) -> list[Any]:
-    """The list that a JSON text holds.
-
-    Raises:
-        ConfigError: it is no JSON, or no list.
-    """
     try:
         found = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{where} is no JSON list of operations: {error}") from None
     if not isinstance(found, list):
         raise ConfigError(f"{where}: expected a JSON list of operations")
-    return found
+    return parse_operations(found, where)
+
+
+def parsed(parse: Callable[[Any], Words], found: Any, where: str) -> Words:  # noqa: ANN401
+    """What pydantic makes of a list of operations, or of an object that holds one.
+
+    Raises:
+        ConfigError: it refuses it; the message says which operation, which field, and why.
+    """
+    try:
+        return parse(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = [*first["loc"]]
+        if len(place) > 1 and isinstance(place[1], int):
+            del place[0]  # the name of the list
+        step = ""
+        if place and isinstance(number := place[0], int):
+            step = f" operation {number + 1}"
+            del place[0]
+        field = ".".join(str(part) for part in place[1:] or place)  # but for the operation's name
+        message = first["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{where}{step}{f', {field}' if field else ''}: {message}") from None
 
 
 def _refuse_constant(name: str) -> float:

@@ -1,39 +1,40 @@
 """What a person changes about the boxes of a scene: pieces joined, tracks cut, strangers deleted.
 
-Edits are a JSON list that can be replayed on the tracks that they were made for. Each names actors
-as they are called after the edits before it.
+A file of edits is a JSON object that names the scene whose tracks they were made for, so that they
+are replayed on these alone. Each edit names actors as they are called after the edits before it.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Int
-from pydantic import AfterValidator, Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
 from lidarpainter_models.editing.script import (
     MOST_OPERATIONS,
     Name,
     OperationWords,
-    json_list,
-    parsed_list,
+    parsed,
 )
 from lidarpainter_models.errors import ConfigError, DataError
-from lidarpainter_models.scenes.schema import is_safe_name
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack, does_move
-from lidarpainter_models.scenes.validation import require_label
+from lidarpainter_models.scenes.validation import require_label, require_name
 
 Tracks = dict[str, ActorTrack]
 """By the id of the actor."""
 
 
 def _is_id(name: str) -> str:
-    if not is_safe_name(name):
-        raise ValueError("expected letters, digits, '.', '_' or '-' for the id of an actor")
-    return name
+    try:
+        return require_name(name, "actor")
+    except DataError as error:
+        raise ValueError(str(error)) from None
 
 
 def _is_category(text: str) -> str:
@@ -70,13 +71,17 @@ class Merge(OperationWords):
         left = {name: track for name, track in tracks.items() if name not in self.actors[1:]}
         return {**left, self.actors[0]: _merged(pieces)}
 
+    def heirs(self, name: str) -> tuple[str, ...]:
+        """What an actor is called afterwards."""
+        return (self.actors[0] if name in self.actors else name,)
+
 
 class Split(OperationWords):
     """From a frame on an actor is another one: two were taken for one."""
 
     op: Literal["split"] = "split"
     actor: Name
-    frame: Annotated[int, Field(ge=0)]
+    frame: Annotated[int, Field(ge=0, le=2**31)]
     name: _Id
     """What it is called from that frame on."""
 
@@ -94,6 +99,10 @@ class Split(OperationWords):
         before, after = (_rows(track, part.nonzero()[:, 0]) for part in (~is_later, is_later))
         return {**tracks, self.actor: before, self.name: replace(after, actor_id=self.name)}
 
+    def heirs(self, name: str) -> tuple[str, ...]:
+        """What an actor is called afterwards: one that is cut has two names."""
+        return (name, self.name) if name == self.actor else (name,)
+
 
 class Delete(OperationWords):
     """There is nobody: leaves, a wall, a reflection."""
@@ -106,6 +115,10 @@ class Delete(OperationWords):
         for name in self.actors:
             _known(tracks, name)
         return {name: track for name, track in tracks.items() if name not in self.actors}
+
+    def heirs(self, name: str) -> tuple[str, ...]:
+        """What an actor is called afterwards: one that is deleted has no name."""
+        return () if name in self.actors else (name,)
 
 
 class Rename(OperationWords):
@@ -134,44 +147,102 @@ class Rename(OperationWords):
             for known, one in tracks.items()
         }
 
+    def heirs(self, name: str) -> tuple[str, ...]:
+        """What an actor is called afterwards."""
+        return (self.name or name,) if name == self.actor else (name,)
+
 
 TrackEdit = Annotated[Merge | Split | Delete | Rename, Field(discriminator="op")]
-_EDITS: TypeAdapter[tuple[TrackEdit, ...]] = TypeAdapter(
-    Annotated[tuple[TrackEdit, ...], Field(strict=False, max_length=MOST_OPERATIONS)]
-)
+MOST_BYTES = 10_000_000
 
 
-def read_track_edits(path: Path) -> tuple[TrackEdit, ...]:
-    """Read a file of edits.
+class TrackEdits(OperationWords):
+    """Edits in the order in which they were made, and the scene that they were made for."""
 
-    Raises:
-        ConfigError: it cannot be read, or is no list of edits; the message says which and why.
-    """
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from None
-    return parsed_list(_EDITS.validate_python, json_list(text, str(path)), str(path))
+    scene: Name
+    """Its id."""
+    digest: Name
+    """Of its content."""
+    edits: Annotated[tuple[TrackEdit, ...], Field(strict=False, max_length=MOST_OPERATIONS)] = ()
+
+    @classmethod
+    def begun(cls, scene: DrivingScene) -> "TrackEdits":
+        """No edit yet."""
+        return cls(scene=f"{scene.dataset}/{scene.sequence}", digest=scene.content_digest)
+
+    @classmethod
+    def read(cls, path: Path, scene: DrivingScene) -> "TrackEdits":
+        """The edits of a scene that a file holds.
+
+        Raises:
+            ConfigError: it cannot be read, holds something else, or edits of another scene; the
+                message says what and where.
+        """
+        try:
+            if path.stat().st_size > MOST_BYTES:
+                raise ConfigError(f"{path}: expected at most {MOST_BYTES / 1e6:g} MB of edits")
+            found = json.loads(path.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise ConfigError(f"{path} is no file of edits: {error}") from None
+        edits = parsed(cls.model_validate, found, str(path))
+        if edits.digest != scene.content_digest:
+            raise ConfigError(
+                f"{path} holds edits of {edits.scene} (content {edits.digest:.12}), expected those "
+                f"of {scene.dataset}/{scene.sequence} (content {scene.content_digest:.12})"
+            )
+        return edits
+
+    def with_edits(self, edits: Sequence[TrackEdit]) -> "TrackEdits":
+        """Other edits of the same scene.
+
+        Raises:
+            ConfigError: they are too many.
+        """
+        if len(edits) > MOST_OPERATIONS:
+            raise ConfigError(f"{len(edits)} edits: expected at most {MOST_OPERATIONS}")
+        return self.model_copy(update={"edits": tuple(edits)})
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @property
+    def file(self) -> bytes:
+        """What `read` reads, an edit a line."""
+        told = self.told
+        lines = ",\n".join(json.dumps(one) for one in told.pop("edits"))
+        head = json.dumps({**told, "edits": []})
+        return f"{head[:-2]}\n{lines}\n]}}\n".encode()
 
 
-def track_edits_json(edits: Sequence[TrackEdit]) -> bytes:
-    """The file that `read_track_edits` reads, an edit a line."""
-    lines = ",\n".join(one.model_dump_json(exclude_none=True) for one in edits)
-    return f"[\n{lines}\n]\n".encode() if edits else b"[]\n"
+def edited_scores(scores: Mapping[str, float], edits: Sequence[TrackEdit]) -> dict[str, float]:
+    """Scores of actors by what these are called after some edits; of merged ones the best."""
+    known = dict(scores)
+    for edit in edits:
+        passed: dict[str, float] = {}
+        for name, score in known.items():
+            for heir in edit.heirs(name):
+                passed[heir] = max(score, passed.get(heir, score))
+        known = passed
+    return known
 
 
-def edited_tracks(tracks: Sequence[ActorTrack], edits: Sequence[TrackEdit]) -> list[ActorTrack]:
+def edited_tracks(
+    tracks: Sequence[ActorTrack], edits: Sequence[TrackEdit], where: str
+) -> list[ActorTrack]:
     """Tracks after some edits, one after another.
 
     Raises:
-        ConfigError: an edit names nobody, or somebody twice; the message says which edit.
+        ConfigError: an edit names nobody, or somebody twice; the message says `where` they come
+            from and which it is.
     """
     known = {track.actor_id: track for track in tracks}
     for number, edit in enumerate(edits, start=1):
         try:
             known = edit.changed(known)
         except ConfigError as error:
-            raise ConfigError(f"edit {number} ({edit.op}): {error}") from None
+            raise ConfigError(f"{where} operation {number}, {edit.op}: {error}") from None
     return list(known.values())
 
 

@@ -12,7 +12,7 @@ for paint, and is named so. A synthetic street
 knows its paint exactly: there the pixels of lines are compared with their true colours as well.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,11 +110,7 @@ def markings_scores(
         ConfigError: no held-out view of a frame with a sweep looks ahead.
     """
     scene, fitted = held_out.scene, shown.scene
-    views = [view for view in held_out.test_views if _looks_ahead(scene, view)]
-    if not views:
-        raise ConfigError(
-            f"{scene.path.name}: no held-out view with a sweep looks ahead, which markings need"
-        )
+    views = views_ahead(scene, held_out.test_views)
     moved = scene.corrected(fitted.cameras.path)
     told_by = "labels" if _paint_classes(scene) else "intensity"
     names = [IMAGE, *(shift.name for shift in (Shift(), *shifts))]
@@ -139,6 +135,20 @@ def markings_scores(
         for name in names
     }
     return {MARKINGS: found}
+
+
+def views_ahead(scene: DrivingScene, held_out: Sequence[RecordedView]) -> list[RecordedView]:
+    """The held-out views that markings are judged on: they look ahead, a sweep tells of the road.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    views = [view for view in held_out if _looks_ahead(scene, view)]
+    if not views:
+        raise ConfigError(
+            f"{scene.path.name}: no held-out view with a sweep looks ahead, which markings need"
+        )
+    return views
 
 
 def road_points(scene: DrivingScene, frame_index: int) -> RoadPoints:

@@ -36,7 +36,7 @@ DENSITY = 1.1
 MOST_PIXELS = 4.0
 """Pixels of all faces together per pixel of the image; beyond it faces are coarser."""
 MOST_TIMES = 4
-"""A face is drawn up to so many times finer, along one axis, than it is sampled."""
+"""A face is drawn up to so many times finer, along one axis, than the lens."""
 MARGIN_PX = 4
 """Around what rays meet of a face: resampling looks at neighbours."""
 Rows = tuple[tuple[int, int, int], ...]

@@ -25,6 +25,8 @@ FRUSTUM_M = 0.6
 FAR_LIDAR_M = 80.0
 """Points from here on take the last colour."""
 POINT_M = 0.03
+MOST_POINTS = 60_000
+"""LiDAR points of a sweep that are shown."""
 LINE_PX = 2.0
 _GOLDEN_ANGLE = 0.618034
 
@@ -105,7 +107,8 @@ class LidarNodes:
         )
 
     def place(self, xyz_m: Float[Tensor, "points 3"], from_world: Float[Tensor, "3"]) -> None:
-        """Show points of the world, coloured by their distance from a place."""
+        """Show points of the world, coloured by how far from a place they lie; of many some."""
+        xyz_m = xyz_m[:: max(-(-len(xyz_m) // MOST_POINTS), 1)]
         range_m = (xyz_m - from_world.to(xyz_m)).norm(dim=1).numpy()
         level = (255 * np.clip(range_m / FAR_LIDAR_M, 0, 1)).astype(np.uint8)
         bgr = cv2.applyColorMap(level[:, None], cv2.COLORMAP_TURBO)

@@ -22,16 +22,16 @@ from lidarpainter_models.editing.track_edits import (
     Rename,
     Split,
     TrackEdit,
+    TrackEdits,
     edited_tracks,
-    read_track_edits,
-    track_edits_json,
 )
-from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.errors import ConfigError, LidarPainterError
 from lidarpainter_models.geometry.boxes import BOX_EDGES, box_corners, first_box_hit
 from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
-from lidarpainter_models.storage.whole_files import write_whole
+from lidarpainter_models.storage.whole_files import storage_errors, write_whole
 from lidarpainter_models.viewing.annotations import LINE_PX, LidarNodes, colour_of, plain
 from lidarpainter_models.viewing.scene_nodes import node_name, place_node
 from lidarpainter_models.viewing.servers import local_server
@@ -41,6 +41,8 @@ PICKED = (PICKED_RGB[0] / 255, PICKED_RGB[1] / 255, PICKED_RGB[2] / 255)
 SEAT_M = (-12.0, 0.0, 8.0)
 """Where a browser looks from at first: behind and above the car."""
 LOOK_AT_M = (15.0, 0.0, 0.0)
+IMAGE_PX = 960
+"""Width of the image in the panel."""
 HINT = "Click on boxes to pick them, on one again to let it go."
 
 
@@ -48,15 +50,17 @@ class LabelSession:
     """The tracks of a scene, what was changed about them, and who is picked."""
 
     def __init__(self, scene: DrivingScene, file: Path) -> None:
-        """Go on where a file of edits ends, if there is one.
+        """Go on where a file of edits ends; one that is not there is begun.
 
         Raises:
-            ConfigError: it is no list of edits, or one of other tracks.
+            ConfigError: it holds something else, or edits of another scene.
+            WriteError: it cannot be written.
         """
         self.scene, self.file = scene, file
-        self.edits: list[TrackEdit] = list(read_track_edits(file)) if file.exists() else []
         self.picked: list[str] = []
-        self.tracks = edited_tracks(scene.tracks, self.edits)
+        with storage_errors(file):
+            is_there = file.exists()
+        self._follow(TrackEdits.read(file, scene) if is_there else TrackEdits.begun(scene))
 
     def change(self, *edits: TrackEdit) -> None:
         """Append edits; the file and the tracks follow, or all stay as they were.
@@ -65,11 +69,19 @@ class LabelSession:
             ConfigError: an edit names nobody, or somebody twice.
             WriteError: the file cannot be written.
         """
-        self._follow([*self.edits, *edits])
+        self._follow(self.made.with_edits([*self.made.edits, *edits]))
+        self.picked += [edit.name for edit in edits if isinstance(edit, Rename) and edit.name]
 
     def undo(self) -> None:
-        """Take the last edit back, if there is one."""
-        self._follow(self.edits[:-1])
+        """Take the last edit back.
+
+        Raises:
+            ConfigError: there is none.
+            WriteError: the file cannot be written.
+        """
+        if not self.made.edits:
+            raise ConfigError("there is no edit to take back")
+        self._follow(self.made.with_edits(self.made.edits[:-1]))
 
     def pick(self, name: str) -> None:
         """Pick an actor, or let it go."""
@@ -90,17 +102,27 @@ class LabelSession:
             other for number in range(2, 10**6) if (other := f"{name}-{number}") not in taken
         )
 
-    def image(self, frame_index: int, camera_name: str) -> UInt8[np.ndarray, "height width 3"]:
-        """What a camera recorded in a frame, with the boxes where they are at the exposure."""
-        view = self.scene.view(frame_index, camera_name)
-        image = self.scene.read_image(view).numpy().copy()
-        draw_boxes(image, view.camera, self.tracks, view.timestamp_ns, picked=self.picked)
+    def image(
+        self, frame_index: int, camera_name: str
+    ) -> UInt8[np.ndarray, "height width 3"] | None:
+        """What a camera recorded in a frame, with the boxes where they are at the exposure.
+
+        None where it took no image in that frame.
+        """
+        here = [one for one in self.scene.views_of(camera_name) if one.frame_index == frame_index]
+        if not here:
+            return None
+        (view,) = here
+        camera = view.camera.no_wider(IMAGE_PX)
+        size = {"width_px": camera.width_px, "height_px": camera.height_px}
+        image = shrink_image(self.scene.read_image(view), **size).numpy().copy()
+        draw_boxes(image, camera, self.tracks, view.timestamp_ns, picked=self.picked)
         return image
 
-    def _follow(self, edits: list[TrackEdit]) -> None:
-        tracks = edited_tracks(self.scene.tracks, edits)
-        write_whole(self.file, track_edits_json(edits))
-        self.edits, self.tracks = edits, tracks
+    def _follow(self, made: TrackEdits) -> None:
+        tracks = edited_tracks(self.scene.tracks, made.edits, str(self.file))
+        write_whole(self.file, made.file)
+        self.made, self.tracks = made, tracks
         known = {track.actor_id for track in tracks}
         self.picked = [name for name in self.picked if name in known]
 
@@ -124,11 +146,15 @@ class LabelControls:
             self.rename = gui.add_button("rename")
             self.let_go = gui.add_button("let all go")
         self.undo = gui.add_button("undo the last edit")
-        self.told = gui.add_markdown("")
+        self.told = gui.add_text("", initial_value="", multiline=True, disabled=True)
 
 
 class LabelViewer:
-    """A session, its nodes and its panel. Callbacks come from viser's threads, one at a time."""
+    """A session, its nodes and its panel.
+
+    Callbacks come from viser's threads and wait for one another. A click means the frame that is
+    shown, which the slider may have left already.
+    """
 
     def __init__(self, server: viser.ViserServer, session: LabelSession) -> None:
         """Show the first frame, and answer the panel from now on."""
@@ -137,16 +163,16 @@ class LabelViewer:
         self._frames = [int(frame) for frame in scene.frame_indices]
         self._world = server.scene.add_frame(ROOT, show_axes=False)
         self._lidar = LidarNodes(server.scene, f"{ROOT}/lidar")
-        self._lidar.cloud.visible = True
         self._boxes: viser.FrameHandle | None = None
+        self._shown: tuple[int, str] | None = None
         server.initial_camera.position, server.initial_camera.look_at = SEAT_M, LOOK_AT_M
         server.gui.configure_theme(show_share_button=False, show_logo=False)
         cameras = list(dict.fromkeys(view.camera_name for view in scene.views))
         self.controls = controls = LabelControls(
             server.gui, num_frames=len(self._frames), cameras=cameras
         )
-        controls.frame.on_update(lambda _: self.show())
-        controls.camera.on_update(lambda _: self.show())
+        controls.frame.on_update(lambda _: self._turn())
+        controls.camera.on_update(lambda _: self._turn())
         controls.merge.on_click(lambda _: self._edit(lambda picked: [Merge(actors=tuple(picked))]))
         controls.split.on_click(lambda _: self._edit(self._splits))
         controls.delete.on_click(
@@ -156,28 +182,38 @@ class LabelViewer:
         controls.undo.on_click(lambda _: self._try(session.undo))
         controls.let_go.on_click(lambda _: self._try(session.picked.clear))
         server.scene.on_click()(self._pick)
-        self.show()
+        self._try(lambda: None)
 
     @property
     def frame_index(self) -> int:
         """The frame that is shown."""
-        return self._frames[min(self.controls.frame.value, len(self._frames) - 1)]
+        return self._frames[0] if self._shown is None else self._shown[0]
 
     def show(self) -> None:
         """Show the frame that the panel says, with the boxes as they are now."""
         with self._lock, self._server.atomic():
-            frame, scene = self.frame_index, self.session.scene
-            ego = scene.world_from_ego[scene.frame_position(frame)]
-            place_node(self._world, invert_rigid(ego))
-            if scene.sweeps_of(frame):
-                self._lidar.place(scene.read_positions(frame), ego[:3, 3])
+            controls, scene = self.controls, self.session.scene
+            frame = self._frames[min(controls.frame.value, len(self._frames) - 1)]
+            if self._shown is None or self._shown[0] != frame:
+                ego = scene.world_from_ego[scene.frame_position(frame)]
+                place_node(self._world, invert_rigid(ego))
+                self._lidar.cloud.visible = bool(scene.sweeps_of(frame))
+                if self._lidar.cloud.visible:
+                    self._lidar.place(scene.read_positions(frame), ego[:3, 3])
+            self._shown = frame, controls.camera.value
             self._show_boxes(frame)
-            try:
-                self.controls.image.image = self.session.image(frame, self.controls.camera.value)
-                self.controls.image.visible = True
-            except LidarPainterError:  # a camera that took no image in this frame
-                self.controls.image.visible = False
-            self.controls.picked.content = self._words()
+            image = self.session.image(*self._shown)
+            controls.image.visible = image is not None
+            if image is not None:
+                controls.image.image = image
+            controls.picked.content = self._words()
+
+    def _turn(self) -> None:
+        """Show what the slider and the camera say, once however often they were moved."""
+        with self._lock:
+            frame = self._frames[min(self.controls.frame.value, len(self._frames) - 1)]
+            if (frame, self.controls.camera.value) != self._shown:
+                self._try(lambda: None)
 
     def _show_boxes(self, frame_index: int) -> None:
         """A box and a name for everybody in a frame, in place of those of the frame before."""
@@ -230,20 +266,29 @@ class LabelViewer:
 
     def _edit(self, edits_of: Callable[[Sequence[str]], Sequence[TrackEdit]]) -> None:
         """Change those picked."""
-        self._try(lambda: self.session.change(*edits_of(self.session.picked)))
+
+        def change() -> None:
+            if not self.session.picked:
+                raise ConfigError("nobody is picked: click on a box first")
+            self.session.change(*edits_of(self.session.picked))
+
+        self._try(change)
 
     def _try(self, act: Callable[[], None]) -> None:
-        """Do something; where it makes no sense the panel says why, and all stays as it was."""
+        """Do something and show what came of it.
+
+        Where it makes no sense the panel says why, and all stays as it was.
+        """
         with self._lock:
             try:
                 act()
-                count = len(self.session.edits)
-                self.controls.told.content = f"{count} edits in `{plain(str(self.session.file))}`"
+                told = f"{len(self.session.made.edits)} edits in {self.session.file}"
+                self.show()
             except LidarPainterError as error:
-                self.controls.told.content = f"**not done:** {plain(str(error))}"
+                told = f"not done: {error}"
             except ValidationError as error:
-                self.controls.told.content = f"**not done:** {plain(error.errors()[0]['msg'])}"
-            self.show()
+                told = f"not done: {error.errors()[0]['msg'].removeprefix('Value error, ')}"
+            self.controls.told.value = told  # type: ignore[misc]  # it has a setter
 
     def _words(self) -> str:
         known = {track.actor_id: track for track in self.session.tracks}

@@ -40,8 +40,6 @@ from lidarpainter_models.viewing.servers import local_server
 
 FRUSTUM_PX = 240
 """Width of a recorded image in its frustum."""
-MOST_POINTS = 60_000
-"""LiDAR points of a sweep that are shown."""
 PAUSED_S = 0.1
 """How often a standing viewer looks whether it is to play."""
 
@@ -93,9 +91,7 @@ class LiveViewer:
                 self._place_rig(view.frame_index)
             self._lidar.cloud.visible = wanted.lidar.value
             if wanted.lidar.value and self._drive.path.recorded.sweeps_of(view.frame_index):
-                points = self._sweep(view.frame_index)
-                every = max(-(-len(points) // MOST_POINTS), 1)
-                self._lidar.place(points[::every], self._seat.centre_world)
+                self._lidar.place(self._sweep(view.frame_index), self._seat.centre_world)
 
     def play(self, stopped: threading.Event) -> None:
         """Let time go on while `play` is ticked, and begin again after the last moment."""

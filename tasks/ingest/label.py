@@ -12,7 +12,7 @@ import torch
 
 from catalog.artefacts import Workplace
 from catalog.store import Store, open_store
-from lidarpainter_models.editing.track_edits import edited_tracks, read_track_edits
+from lidarpainter_models.editing.track_edits import TrackEdits, edited_scores, edited_tracks
 from lidarpainter_models.lidar.movers import FoundActor, box_of, find_movers, unboxed
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.frame_content import FrameContent
@@ -116,19 +116,22 @@ def ingest_edited(
         sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
 
     Raises:
-        ConfigError: the edits are of other boxes, or a scene of that name was made otherwise.
+        ConfigError: the file is no file of edits, its edits are of another scene, or a scene of
+            that name was made otherwise.
     """
     store = open_store(store_path)
     scene = open_posed(store, scene_id)
-    tracks = edited_tracks(scene.tracks, read_track_edits(edits))
+    made = TrackEdits.read(edits, scene)
+    tracks = edited_tracks(scene.tracks, made.edits, str(edits))
     name = sequence or scene.sequence + EDITED_SUFFIX
-    ids = {track.actor_id for track in tracks}
-    scores = {name: one for name, one in scene.manifest.get(LABELLED, {}).items() if name in ids}
+    scores = scene.manifest.get(LABELLED)
+    if scores is not None:
+        scores = edited_scores(scores, made.edits)
 
     def edited(frame: FrameContent) -> FrameContent:
         return replace(frame, boxes=track_boxes(tracks, frame.frame_index))
 
-    return _with_boxes(store, scene, name, edited, scores, {"edits": read_json(edits)})
+    return _with_boxes(store, scene, name, edited, scores, made.told)
 
 
 def _with_boxes(
@@ -136,16 +139,17 @@ def _with_boxes(
     scene: DrivingScene,
     name: str,
     change: Callable[[FrameContent], FrameContent],
-    scores: Mapping[str, float],
+    scores: Mapping[str, float] | None,
     told: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Write a scene under another name, with other boxes; returns its row in `scenes`.
 
-    `scores` are those of boxes that were found, `told` is how the boxes came to be.
+    `scores` are those of boxes that were found, None where nobody sought any; `told` is how the
+    boxes came to be.
     """
     require_free(store, scene, name, STAGE)
     entries = {key: scene.manifest[key] for key in FURTHER_ENTRIES if key in scene.manifest}
-    header = header_of(scene, {**entries, LABELLED: dict(scores)} if scores else entries)
+    header = header_of(scene, entries if scores is None else {**entries, LABELLED: dict(scores)})
     made_from = {"from": f"{scene.dataset}/{scene.sequence}", "digest": scene.content_digest}
     with writing(store, f"{scene.dataset}/{name}"):
         path = write_anew(
@@ -175,7 +179,8 @@ def label_by_hand(
         stopped: ends the viewer when it is set.
 
     Raises:
-        ConfigError: the port cannot be had, or the file holds edits of other boxes.
+        ConfigError: the port cannot be had, the file cannot be written, or is no file of edits of
+            this scene.
     """
     from lidarpainter_models.viewing.label_viewer import LabelSession, label_viewer
 

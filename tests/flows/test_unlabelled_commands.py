@@ -93,7 +93,9 @@ def test_boxes_that_a_person_changed_are_written_as_they_were_changed(store, tmp
         {"op": "delete", "actors": [first]},
         {"op": "rename", "actor": second, "name": "bus-1", "category": "bus"},
     ]
-    edits.write_text(json.dumps(changes))
+    scene = scene_of(store, STREET)
+    head = {"scene": STREET, "digest": scene.content_digest}
+    edits.write_text(json.dumps({**head, "edits": changes}))
     monkeypatch.setattr("flows.cli.view.threading", Mock())  # else it shows until Ctrl-C
     monkeypatch.setattr("webbrowser.open", visited.append)
     shown = succeed("view", STREET, "--label", "--edits", edits, store=store)
@@ -111,7 +113,7 @@ def test_boxes_that_a_person_changed_are_written_as_they_were_changed(store, tmp
     [
         (("view", STREET, "--label", "--camera", "front"), "--label has no use for --camera"),
         (("view", STREET, "--edits", "a.json"), "view of a run has no use for --edits"),
-        (("label", STREET, "--edits", "missing.json"), "missing.json cannot be read"),
+        (("label", STREET, "--edits", "missing.json"), "missing.json is no file of edits"),
         (("label", STREET, "--edits", "a.json", "--complete"), "--edits has no use for --complete"),
     ],
 )

@@ -91,11 +91,6 @@ def replace(file, content):
     os.utime(file, ns=(next(_ticks), next(_ticks)))
 
 
-def peak_bytes():
-    """Largest resident set of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
 def judge(ingest, *, store, sandbox, named):
     """Run one ingest and tell how it ended.
 

@@ -8,8 +8,8 @@ import torch
 import viser
 from tiny_street import tiny_street
 
-from lidarpainter_models.editing.track_edits import Delete, Merge, edited_tracks, read_track_edits
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.editing.track_edits import Delete, Merge, Rename, TrackEdits
+from lidarpainter_models.errors import ConfigError, WriteError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import write_street
 from lidarpainter_models.viewing.label_viewer import LabelSession, LabelViewer
@@ -47,6 +47,16 @@ def click_on(viewer, name):
     viewer._pick(event)
 
 
+def press(button):
+    """What a browser does to a button."""
+    for callback in button._impl.update_cb:
+        callback(Mock())
+
+
+def edits_in_file(viewer):
+    return TrackEdits.read(viewer.session.file, viewer.session.scene).edits
+
+
 def names_here(viewer):
     return [track.actor_id for track, _ in viewer.session.present(viewer.frame_index)]
 
@@ -80,20 +90,29 @@ def test_what_is_done_by_click_is_shown_and_written_and_undone(viewer, scene):
     first, second, *_ = names_here(viewer)
     for name in (first, second):
         click_on(viewer, name)
-    viewer._edit(lambda picked: [Merge(actors=tuple(picked))])
+    press(viewer.controls.merge)
     assert second not in names_here(viewer)
     assert viewer.session.picked == [first]
-    assert read_track_edits(viewer.session.file) == (Merge(actors=(first, second)),)
-    viewer.controls.name.value, viewer.controls.category.value = "", "truck"
-    viewer._edit(viewer._renames)
+    viewer.controls.name.value, viewer.controls.category.value = "one", "truck"
+    press(viewer.controls.rename)
     told = {track.actor_id: track.category for track in viewer.session.tracks}
-    assert told[first] == "truck"
+    assert told["one"] == "truck"
+    assert viewer.session.picked == ["one"]
+    press(viewer.controls.delete)
+    assert not {first, second, "one"} & set(names_here(viewer))
+    assert edits_in_file(viewer) == (
+        Merge(actors=(first, second)),
+        Rename(actor=first, name="one", category="truck"),
+        Delete(actors=("one",)),
+    )
     again = LabelSession(scene, viewer.session.file)
     assert [one.actor_id for one in again.tracks] == [one.actor_id for one in viewer.session.tracks]
     for _ in range(3):
-        viewer._try(viewer.session.undo)
+        press(viewer.controls.undo)
     assert names_here(viewer)[:2] == [first, second]
-    assert read_track_edits(viewer.session.file) == ()
+    assert edits_in_file(viewer) == ()
+    press(viewer.controls.undo)
+    assert "no edit" in viewer.controls.told.value
 
 
 def test_a_track_is_cut_at_the_frame_that_is_shown(viewer):
@@ -104,7 +123,7 @@ def test_a_track_is_cut_at_the_frame_that_is_shown(viewer):
         if int(track.frame_indices[0]) < viewer.frame_index
     )
     viewer.session.pick(name)
-    viewer._edit(viewer._splits)
+    press(viewer.controls.split)
     parts = {one.actor_id: one.frame_indices.tolist() for one in viewer.session.tracks}
     assert parts[name][-1] < viewer.frame_index == parts[f"{name}-2"][0]
 
@@ -113,12 +132,32 @@ def test_what_makes_no_sense_changes_nothing_and_says_why(viewer):
     name = names_here(viewer)[0]
     click_on(viewer, name)
     before = viewer.session.tracks
-    viewer._edit(lambda picked: [Merge(actors=tuple(picked))])
-    assert "not done" in viewer.controls.told.content
-    viewer._edit(lambda _: [Delete(actors=("nobody",))])
-    assert "no actor" in viewer.controls.told.content
+    press(viewer.controls.merge)
+    assert "not done" in viewer.controls.told.value
+    press(viewer.controls.let_go)
+    for button in (viewer.controls.split, viewer.controls.delete, viewer.controls.rename):
+        press(button)
+        assert "nobody is picked" in viewer.controls.told.value
     assert viewer.session.tracks is before
-    assert not viewer.session.file.exists()
+    assert edits_in_file(viewer) == ()
+
+
+def test_a_frame_without_a_sweep_shows_no_points(viewer, monkeypatch):
+    assert viewer._lidar.cloud.visible
+    monkeypatch.setattr(viewer.session.scene, "sweeps_of", lambda _: ())
+    viewer.controls.frame.value = 1
+    viewer.show()
+    assert not viewer._lidar.cloud.visible
+
+
+def test_a_click_means_the_frame_that_is_shown(viewer):
+    shown = viewer.frame_index
+    viewer.controls.frame.on_update(lambda _: None)
+    viewer._turn = lambda: None  # the slider is ahead of what is drawn
+    for callback in list(viewer.controls.frame._impl.update_cb):
+        viewer.controls.frame.remove_update_callback(callback)
+    viewer.controls.frame.value = 3
+    assert viewer.frame_index == shown
 
 
 def test_who_is_picked_is_drawn_otherwise_over_the_image(viewer, scene):
@@ -135,7 +174,13 @@ def test_who_is_picked_is_drawn_otherwise_over_the_image(viewer, scene):
 
 def test_edits_of_other_boxes_are_refused(scene, tmp_path):
     file = tmp_path / "edits.json"
-    file.write_text('[{"op": "delete", "actors": ["nobody"]}]')
-    with pytest.raises(ConfigError, match="edit 1"):
+    file.write_bytes(TrackEdits(scene="other/one", digest="0" * 64).file)
+    with pytest.raises(ConfigError, match="holds edits of other/one"):
         LabelSession(scene, file)
-    assert edited_tracks(scene.tracks, []) == list(scene.tracks)
+    nobody = TrackEdits.begun(scene).with_edits([Delete(actors=("nobody",))])
+    file.write_bytes(nobody.file)
+    with pytest.raises(ConfigError, match="operation 1, delete"):
+        LabelSession(scene, file)
+    assert file.read_bytes() == nobody.file
+    with pytest.raises(WriteError):
+        LabelSession(scene, file / "in-a-file.json")

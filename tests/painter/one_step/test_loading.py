@@ -257,14 +257,14 @@ import torch
 from lidarpainter_models.painter import weight_reading
 from tasks.measuring import measured
 
-tensor_files.PORTION_NUMBERS = 1 << 22  # 16 MB of float32
+weight_reading.PORTION_NUMBERS = 1 << 22  # 16 MB of float32
 with torch.device("meta"):
     layers = [torch.nn.Linear(2048, 2048, bias=False) for _ in range(24)]
     module = torch.nn.Sequential(*layers)
 with measured() as nothing:
     pass
 with measured() as loading:
-    tensor_files.fill_from_file(module, Path(sys.argv[1]), dtype=torch.bfloat16)
+    weight_reading.fill_from_file(module, Path(sys.argv[1]), dtype=torch.bfloat16)
 assert all(bool((layer.weight == 1).all()) for layer in module)
 print(loading.peak_memory_bytes - nothing.peak_memory_bytes)
 """
