@@ -142,7 +142,7 @@ def test_a_store_in_which_nothing_is_stored_is_none(store, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("writers", "commits"), [(2, 5), pytest.param(8, 200, marks=pytest.mark.slow)]
+    ("writers", "commits"), [(2, 5), pytest.param(8, 25, marks=pytest.mark.slow)]
 )
 def test_no_commit_is_lost_or_doubled(store, writers, commits):
     run_all(WRITER, *[(store.name, writer, commits) for writer in range(writers)])

@@ -1,9 +1,7 @@
 """A scene written as NCore is opened by NVIDIA's own library, field by field, and read back."""
 
-import os
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,7 +27,6 @@ from lidarpainter_models.synthetic import (
     record_street,
 )
 
-SHARED = os.environ.get("LIDARPAINTER_SHARED")
 NAME = "synthetic_street-0005"
 
 
@@ -220,9 +217,8 @@ def test_absent_library_is_named(street, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not SHARED, reason="LIDARPAINTER_SHARED names no folder with real logs")
-def test_real_log_is_opened_and_comes_back(tmp_path):
-    root = Path(SHARED, "data/pandaset")
+def test_real_log_is_opened_and_comes_back(tmp_path, shared_folder):
+    root = shared_folder / "data/pandaset"
     path = ingest_scene("pandaset", root, "002", tmp_path / "store", frames=slice(0, 28))
     scene = DrivingScene.open(path)
     loader, told = written(scene, tmp_path / "log")

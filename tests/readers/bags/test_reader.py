@@ -1,10 +1,8 @@
 """A scene written as a bag and read back is the same scene."""
 
 import io
-import os
 from dataclasses import replace
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -20,8 +18,6 @@ from lidarpainter_models.readers.source_logs.log import write_log
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.image_bytes import decode_image
 from tasks.ingest.rigs import propose_rig
-
-SHARED = os.environ.get("LIDARPAINTER_SHARED")
 
 
 def read(root, name, store, **options):
@@ -226,10 +222,9 @@ def test_what_a_bag_lacks_is_told_by_the_rig(street, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not SHARED, reason="LIDARPAINTER_SHARED names no folder with real logs")
-def test_real_log_comes_back_from_a_bag(tmp_path):
+def test_real_log_comes_back_from_a_bag(tmp_path, shared_folder):
     """Six frames of PandaSet 002: six cameras, both LiDARs, boxes."""
-    root = Path(SHARED) / "data/pandaset"
+    root = shared_folder / "data/pandaset"
     real = DrivingScene.open(
         ingest_scene("pandaset", root, "002", tmp_path / "real", frames=slice(0, 6))
     )

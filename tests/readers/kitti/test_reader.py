@@ -1,9 +1,7 @@
 """A scene written as KITTI and read back is the same scene."""
 
-import os
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from lidarpainter_models.checks.doctor import check_scene
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
-SHARED = os.environ.get("LIDARPAINTER_SHARED")
 REAL = "data/strangers/kitti/drive_0005"
 LEAN_DEG = 1.0
 """A tracklet turns about the LiDAR's upright axis alone, a label about the camera's."""
@@ -64,9 +61,8 @@ def test_layouts_give_the_same_scene_but_for_the_names_of_actors(read):
     assert found.point_m < 1e-4
 
 
-@pytest.mark.skipif(not SHARED, reason="LIDARPAINTER_SHARED names no folder with real logs")
-def test_real_drive_comes_back_from_a_raw_folder(tmp_path):
-    real = DrivingScene.open(Path(SHARED) / REAL)
+def test_real_drive_comes_back_from_a_raw_folder(tmp_path, shared_folder):
+    real = DrivingScene.open(shared_folder / REAL)
     real = reduced(real, num_frames=4, cameras=("left", "right"), num_actors=3)
     names = {"image_02": "left", "image_03": "right"}
     write_kitti_raw(real, tmp_path / "kitti", names)
