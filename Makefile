@@ -10,7 +10,6 @@ FIGURES := $(BIN)/lidarpainter --store figures-store
 
 # spinning OpenMP threads turn shared cores into many times the CPU time
 export OMP_WAIT_POLICY := passive
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
 .PHONY: demo test lint nightly bench docs figures gpu-check clean
 

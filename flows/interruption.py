@@ -74,6 +74,11 @@ def starts_anew(what: str) -> None:
     _message[:] = [f"interrupted; the same command begins {what} anew"]
 
 
+def ends_as_meant() -> None:
+    """Let an interrupted command say that it is closed: nothing was left half done."""
+    _message[:] = ["closed"]
+
+
 def message() -> str:
     """What the command says when it is interrupted."""
     return _message[0]

@@ -45,9 +45,11 @@ def write(log: Path, num_frames: int = 20, width_px: int = 480) -> None:
         height_px=width_px * 9 // 16,
         cameras=DEFAULT_CAMERAS[:1],
     )
+    sys.stdout.write(f"drawing {num_frames} frames of a street\n")
     with tempfile.TemporaryDirectory() as folder:
         scene = lp.open_scene(lp.write_street(street, Path(folder)))
         _write_files(scene, log)
+    sys.stdout.write(f"the log lies in {log}\n")
 
 
 def _write_files(scene: DrivingScene, log: Path) -> None:

@@ -12,10 +12,10 @@ from flows.cli.shared_options import (
     TrajectorySpec,
     checked_words,
     described,
+    in_words,
     parse_frames,
     parse_previous,
     refuse_unused,
-    with_told_collisions,
 )
 from lidarpainter_models.errors import ConfigError
 
@@ -124,7 +124,7 @@ def _render_images(run: str, request: "ViewRequest", out: Path, *, as_json: bool
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"images of {result['scene']}", with_told_collisions(result))
+        print_pairs(f"images of {result['scene']}", in_words(result))
 
 
 def _refuse_of_images(given: Sequence[object], flags: Sequence[bool]) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from flows.cli.output import clear_status
 from flows.cli.shared_options import check_painter, described, named_run, parse_bytes, parse_seconds
+from flows.interruption import ends_as_meant, starts_anew
 from lidarpainter_models.devices import check_device
 from lidarpainter_models.errors import ConfigError
 
@@ -105,7 +106,6 @@ def serve(  # noqa: PLR0913 - the options of a command
 def start(request: "ServeRequest") -> None:
     """Learn what is to be learnt, then answer until a signal comes."""
     from catalog.store import existing_store
-    from flows.interruption import starts_anew
     from flows.serve import serve_runs
 
     starts_anew("the server")
@@ -126,6 +126,7 @@ def learn(store: "Store", runs: Sequence[str]) -> None:
 
 def opened_at(address: str, http_address: str | None) -> None:
     """Print where the server can be reached."""
+    ends_as_meant()
     clear_status()
     for one in (address, http_address):
         if one is not None:

@@ -126,12 +126,20 @@ def checked_words(run: str, trajectory: str, painter: str | None) -> str:
     return run_id
 
 
-def with_told_collisions(result: dict[str, Any]) -> dict[str, Any]:
-    """A result for a table: what the camera ran into in one line."""
+def in_words(result: dict[str, Any]) -> dict[str, Any]:
+    """What `render` gives, for a table: what the camera ran into, how far to trust the scene."""
+    from lidarpainter_models.evaluation.view_confidence import GOOD_DB, PROMISED
     from lidarpainter_models.lidar.collisions import Collision
 
-    told = "; ".join(str(Collision(**found)) for found in result["collisions"])
-    return {**result, "collisions": told or "none"}
+    met = "; ".join(str(Collision(**found)) for found in result["collisions"])
+    shown = {**result, "collisions": met or "none"}
+    trusted = shown.pop("num_trusted")
+    if trusted is not None:
+        shown["promised"] = (
+            f"{trusted} of {result['num_images']} views: before any painting the scene shows them "
+            f"with {GOOD_DB:g} dB or more, at a probability of at least {PROMISED:g}"
+        )
+    return shown
 
 
 def refuse_unused(by: str, given: Mapping[str, bool]) -> None:

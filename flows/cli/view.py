@@ -11,6 +11,7 @@ import typer
 
 from flows.cli.output import clear_status
 from flows.cli.shared_options import described, named_run, parse_frames, refuse_unused
+from flows.interruption import ends_as_meant
 
 WORDS = """
 view.run: Which run, as elsewhere; with --label the scene whose boxes are mended.
@@ -48,6 +49,7 @@ def view(  # noqa: PLR0913 - the options of a command
     """
 
     def opened_at(address: str) -> None:
+        ends_as_meant()
         clear_status()
         sys.stdout.write(f"{address}\n")
         sys.stdout.flush()

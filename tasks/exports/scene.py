@@ -42,7 +42,7 @@ def export_video(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str
         with new_folder(out) as folder:
             films = [folder / f"{path.camera_name}{VIDEO_ENDING}" for path in paths]
             made = write_paths(viewed, paths, request, [folder] * len(paths), films=films)
-    return {"path": str(out), **_without_collisions(made)}
+    return {"path": str(out), **_of_export(made)}
 
 
 def export_images(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
@@ -57,11 +57,13 @@ def export_images(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[st
     with new_folder(out) as folder:
         places = [folder / path.camera_name if len(paths) > 1 else folder for path in paths]
         made = write_paths(viewed, paths, request, places)
-    return {"path": str(out), **_without_collisions(made)}
+    return {"path": str(out), **_of_export(made)}
 
 
-def _without_collisions(made: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in made.items() if name != "collisions"}
+def _of_export(made: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value for name, value in made.items() if name not in ("collisions", "num_trusted")
+    }
 
 
 STAGE = "export"

@@ -9,7 +9,7 @@ from typing import Any
 from lidarpainter_models.conditioning.followed_paths import FollowedPath
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.anchoring import calibration_of
-from lidarpainter_models.evaluation.view_confidence import Calibration
+from lidarpainter_models.evaluation.view_confidence import PROMISED, Calibration
 from lidarpainter_models.export import view_requests
 from lidarpainter_models.export.view_files import Delivery, legend, write_views
 from lidarpainter_models.export.view_requests import ViewRequest
@@ -63,6 +63,7 @@ def render(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]
     return {
         "folder": str(out),
         "num_images": made["num_images"],
+        "num_trusted": made["num_trusted"],
         "camera": paths[0].camera_name,
         "cameras": made["cameras"],
         "collisions": made["collisions"],
@@ -100,7 +101,9 @@ def write_paths(
     """Write the files of every path to its folder, with their poses; tells how far it is.
 
     Returns:
-        `num_images`, `cameras`, `collisions`, and `fps` where there are films.
+        `num_images`, `cameras`, `collisions`, `num_trusted` (views that the scene is promised to
+        show well before anybody paints them, None where nothing is known of them), and `fps` where
+        there are films.
     """
     done, total, kinds = 0, sum(len(path.views) for path in paths), request.kinds
     listener().started(STAGE)
@@ -128,8 +131,12 @@ def write_paths(
         if kinds.has_poses:
             about = {"trajectory": path.trajectory.spec, "collisions": met}
             write_json(folder / POSES_FILE, {**about, "images": rows})
+    known = [row["confidence"] for rows in written for row in rows if "confidence" in row]
     return {
         "num_images": total,
+        "num_trusted": None
+        if None in known or not known
+        else sum(confidence >= PROMISED for confidence in known),
         "cameras": ", ".join(path.camera_name for path in paths),
         "collisions": [found for met in collisions for found in met],
         **({"fps": fps} if kinds.video else {}),

@@ -3,6 +3,8 @@
 import pytest
 from commands import call, succeed
 
+from flows import interruption
+
 
 def test_page_is_one_file_that_names_the_scene(tiny_run, tmp_path):
     out = tmp_path / "drive.html"
@@ -42,3 +44,4 @@ def test_view_says_where_it_is_and_opens_a_browser_there(tiny_run, monkeypatch):
     answer = succeed("view", "latest", store=tiny_run.store)
     assert answer.out.startswith("http://127.0.0.1:")
     assert answer.out.splitlines() == visited
+    assert interruption.message() == "closed"  # what Ctrl-C says from then on

@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from flows.cli.output import format_bytes, format_cell, print_json, print_pairs, print_table
 from flows.cli.progress import Bars, Lines, shown_progress
+from flows.cli.shared_options import in_words
 from flows.time_prediction import Clock
 from tasks.progress import listener
 
@@ -19,6 +20,14 @@ from tasks.progress import listener
 )
 def test_cells_are_short_and_never_markup(value, expected):
     assert format_cell(value) == expected
+
+
+def test_what_is_known_of_images_is_said_in_words():
+    told = in_words({"num_images": 28, "collisions": [], "num_trusted": 3})
+    assert told["collisions"] == "none"
+    assert told["promised"].startswith("3 of 28 views: before any painting")
+    assert "25 dB or more, at a probability of at least 0.9" in told["promised"]
+    assert "promised" not in in_words({"num_images": 28, "collisions": [], "num_trusted": None})
 
 
 @pytest.mark.parametrize(

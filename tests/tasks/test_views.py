@@ -8,7 +8,7 @@ import pytest
 
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.evaluation.view_confidence import BUNDLED
+from lidarpainter_models.evaluation.view_confidence import BUNDLED, PROMISED
 from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
@@ -116,3 +116,5 @@ def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(viewed, tmp_path):
     assert made["collisions"][0]["obstacle"] == "points"
     described = json.loads((out / "trajectory.json").read_text())
     assert described["collisions"] == made["collisions"]
+    promised = [row for row in described["images"] if row["confidence"] >= PROMISED]
+    assert made["num_trusted"] == len(promised)
