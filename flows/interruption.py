@@ -69,6 +69,11 @@ def leave(code: int) -> NoReturn:
     os._exit(code)
 
 
+def goes_on() -> None:
+    """Let an interrupted command say that the same one goes on, as all do but for these below."""
+    _message[:] = [MESSAGE]
+
+
 def starts_anew(what: str) -> None:
     """Let an interrupted command say that the same one does not go on, but begins something."""
     _message[:] = [f"interrupted; the same command begins {what} anew"]

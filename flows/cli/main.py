@@ -44,7 +44,7 @@ from flows.cli import (
 )
 from flows.cli.output import Loudness, complain, loudness, set_loudness
 from flows.environment import keep_prefect_in, prepare_environment
-from flows.interruption import Interrupted, is_interrupted, message
+from flows.interruption import Interrupted, goes_on, is_interrupted, message
 from lidarpainter_models import __version__
 from lidarpainter_models.errors import ConfigError, LidarPainterError
 
@@ -163,6 +163,7 @@ def options(
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
+    goes_on()
     words = globals_first(arguments)
     chosen = {word for word in words if word in GLOBAL_FLAGS}
     is_debug = "--debug" in chosen
