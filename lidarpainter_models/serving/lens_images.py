@@ -67,8 +67,6 @@ class Face:
     """Which pixels of that part are its own."""
     places: Float[np.ndarray, "rows columns 2"]
     """Where in the face the middles of the part's pixels lie, in pixels of the pinhole."""
-    steps: Float[np.ndarray, "2 rows columns 2"]
-    """From there to the next column and to the next row."""
     times: int
     """How many pixels are drawn for one of the pinhole, along one axis: Gaussians are made for the
     pixels that they were fitted to, in coarser ones thin things are too wide. A pixel of the lens
@@ -93,8 +91,9 @@ class Face:
         between = cv2.INTER_CUBIC if self.times == 1 else cv2.INTER_LINEAR
         aside = (np.arange(self.times, dtype=np.float32) + 0.5) / self.times - 0.5
         found = np.zeros((*self.is_own.shape, 3), np.float32)
+        to_right, to_below = (_steps(self.places, self.is_own, axis) for axis in (1, 0))
         for across, down in product(aside, aside):
-            at = self.places + across * self.steps[0] + down * self.steps[1]
+            at = self.places + across * to_right + down * to_below
             # OpenCV counts from the middle of a pixel
             column, row = cv2.split(self.times * at - np.float32(0.5))
             found += cv2.remap(drawn, column, row, between, borderMode=cv2.BORDER_REPLICATE)
@@ -223,7 +222,6 @@ class _Part:
             columns=columns,
             is_own=part.numpy(),
             places=places.numpy(),
-            steps=torch.stack([_steps(places, part, axis) for axis in (1, 0)]).numpy(),
             times=min(max(round(fitted_px / focal_px), 1), MOST_TIMES),
         )
 
@@ -242,20 +240,20 @@ def _finest_step(met: Float[Tensor, "height width 2"], own: Bool[Tensor, "height
 
 
 def _steps(
-    places: Float[Tensor, "rows columns 2"], is_own: Bool[Tensor, "rows columns"], axis: int
-) -> Float[Tensor, "rows columns 2"]:
-    """Between the places of neighbours along an axis: the mean of both sides, where both are own.
+    places: Float[np.ndarray, "rows columns 2"], is_own: np.ndarray, axis: int
+) -> Float[np.ndarray, "rows columns 2"]:
+    """From each place to its neighbour's along an axis: the mean of both sides, where both are own.
 
     A pixel without an own neighbour there has a step of nothing.
     """
-    count = is_own.shape[axis] - 1
-    both = is_own.narrow(axis, 1, count) & is_own.narrow(axis, 0, count)
-    step = torch.where(both[..., None], places.diff(dim=axis), 0.0)
-    total, sides = torch.zeros_like(places), torch.zeros_like(places[..., :1])
-    for start in (0, 1):
-        total.narrow(axis, start, count).add_(step)
-        sides.narrow(axis, start, count).add_(both[..., None])
-    return total / sides.clamp(min=1)
+    before, after = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
+    both = (is_own[before] & is_own[after])[..., None]
+    step = np.where(both, np.diff(places, axis=axis), np.float32(0))
+    total, sides = np.zeros_like(places), np.zeros_like(places[..., :1])
+    for side in (before, after):
+        total[side] += step
+        sides[side] += both
+    return total / np.maximum(sides, 1)
 
 
 def _reach(is_there: Bool[Tensor, " places"]) -> slice:

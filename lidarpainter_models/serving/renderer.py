@@ -301,15 +301,20 @@ class ServedScene:
         return sum(each.is_seen.numel() for each in self._lenses.values())
 
     def _looked_at(self, request: SensorRequest, moment: Moment) -> Camera:
-        """A pinhole that sees what an image shows, or the middle part of it."""
+        """A pinhole that sees what an image shows, or the middle part of it.
+
+        Straight ahead and narrow, where the image shows nothing ahead.
+        """
         pinhole = request.camera.pinhole_at(moment.world_from_camera)
         if pinhole is not None:
             camera = moment.recorded or replace(pinhole, shutter=moment.shutter)
             size = {"width_px": camera.width_px, "height_px": camera.height_px}
             return camera.resized(**{name: max(px, LEAST_PX) for name, px in size.items()})
-        rays = self.lens(request.camera).rays[::8, ::8].reshape(-1, 3)
-        ahead = rays[rays[:, 2] > 0.1]
-        reach = (ahead[:, :2] / ahead[:, 2:]).abs().amax(dim=0).clamp(max=MIDDLE_TANGENT)
+        rays = self.lens(request.camera).rays
+        every = min(8, max(min(rays.shape[:2]) // 8, 1))
+        rays = rays[::every, ::every].reshape(-1, 3)
+        tangent = (rays[:, :2] / rays[:, 2:].clamp(min=0.1)).abs()[rays[:, 2] > 0.1]
+        reach = torch.cat([torch.zeros(1, 2), tangent]).amax(dim=0).clamp(max=MIDDLE_TANGENT)
         focal_px = EVIDENCE_WIDTH_PX / 2 / max(float(reach[0]), 0.05)
         height_px = max(round(2 * focal_px * float(reach[1])), LEAST_PX)
         return Camera.centred(

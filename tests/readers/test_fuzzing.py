@@ -11,7 +11,7 @@ from waymo_edits import records_in
 from waymo_records import tfrecord
 from written_logs import WRITERS
 
-NUM_FAST, NUM_NIGHT = 8, 800
+NUM_FAST, NUM_NIGHT = 8, 250
 END_BYTES = 1024
 # Python's own unpickling of texts warns of what a damaged one holds
 pytestmark = pytest.mark.filterwarnings("ignore:invalid escape sequence:DeprecationWarning")
@@ -69,7 +69,7 @@ def test_damaged_log_is_refused_or_sound(log, tmp_path):
 
 @pytest.mark.slow
 def test_damaged_logs_of_the_day(log, tmp_path):
-    """Others every day, so that a month of nights tries 24,000; a failure tells its seed."""
+    """Others every day, so that a month of nights tries 7,500; a failure tells its seed."""
     first = NUM_NIGHT * date.today().toordinal()
     outcomes = fuzzed(log, tmp_path, range(first, first + NUM_NIGHT))
     assert outcomes["refused"] + outcomes["accepted"] == NUM_NIGHT
