@@ -90,6 +90,10 @@ class LabelSession:
         else:
             self.picked.append(name)
 
+    def let_go(self) -> None:
+        """Pick nobody."""
+        self.picked = []
+
     def present(self, frame_index: int) -> list[tuple[ActorTrack, torch.Tensor]]:
         """Who has a box in a frame, each with its `world_from_box` there."""
         rows = [(track, (track.frame_indices == frame_index).nonzero()) for track in self.tracks]
@@ -180,7 +184,7 @@ class LabelViewer:
         )
         controls.rename.on_click(lambda _: self._edit(self._renames))
         controls.undo.on_click(lambda _: self._try(session.undo))
-        controls.let_go.on_click(lambda _: self._try(session.picked.clear))
+        controls.let_go.on_click(lambda _: self._try(session.let_go))
         server.scene.on_click()(self._pick)
         self._try(lambda: None)
 

@@ -98,6 +98,9 @@ def test_what_is_done_by_click_is_shown_and_written_and_undone(viewer, scene):
     told = {track.actor_id: track.category for track in viewer.session.tracks}
     assert told["one"] == "truck"
     assert viewer.session.picked == ["one"]
+    press(viewer.controls.let_go)
+    assert viewer.session.picked == []
+    viewer.session.pick("one")
     press(viewer.controls.delete)
     assert not {first, second, "one"} & set(names_here(viewer))
     assert edits_in_file(viewer) == (
