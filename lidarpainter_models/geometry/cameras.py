@@ -185,19 +185,23 @@ class Camera:
         inside = (u >= 0) & (u < self.width_px) & (v >= 0) & (v < self.height_px)
         return inside & (depth_m > near_m)
 
-    def may_see(self, centre_world: Float[Tensor, "3"], radius_m: float) -> bool:
-        """Whether any part of a ball can fall into the image; false where surely none does."""
-        seen_from = self.camera_from_world
-        x, y, z = (seen_from[:3, :3] @ centre_world.double() + seen_from[:3, 3]).tolist()
+    def may_see(
+        self, centres_world: Float[Tensor, "balls 3"], radius_m: Float[Tensor, " balls"]
+    ) -> Bool[Tensor, " balls"]:
+        """Whether any part of each ball can fall into the image; false where surely none does."""
+        seen_from = self.camera_from_world.to(centres_world.device)
+        x, y, z = transform_points(seen_from, centres_world.double()).unbind(-1)
         right_px, below_px = self.width_px - self.cx_px, self.height_px - self.cy_px
-        inside_m = (
-            z,
-            (x * self.fx_px + z * self.cx_px) / hypot(self.fx_px, self.cx_px),
-            (z * right_px - x * self.fx_px) / hypot(self.fx_px, right_px),
-            (y * self.fy_px + z * self.cy_px) / hypot(self.fy_px, self.cy_px),
-            (z * below_px - y * self.fy_px) / hypot(self.fy_px, below_px),
+        inside_m = torch.stack(
+            [
+                z,
+                (x * self.fx_px + z * self.cx_px) / hypot(self.fx_px, self.cx_px),
+                (z * right_px - x * self.fx_px) / hypot(self.fx_px, right_px),
+                (y * self.fy_px + z * self.cy_px) / hypot(self.fy_px, self.cy_px),
+                (z * below_px - y * self.fy_px) / hypot(self.fy_px, below_px),
+            ]
         )
-        return min(inside_m) > -radius_m - 1e-3
+        return inside_m.amin(dim=0) > -radius_m - 1e-3
 
     def pixel_directions(
         self, device: torch.device | None = None

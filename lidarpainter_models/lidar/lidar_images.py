@@ -142,12 +142,28 @@ def _points_around(
     recent = [street.points(street.age_ns <= window_ns)]
     older = street.points((street.age_ns > window_ns) & (street.age_ns <= reach_ns))
     image = with_margin(camera, margin_px, margin_px)
-    for track, world_from_box in actors.placed(timestamp_ns):
-        points = lidar_map.actors.get(track.actor_id)
-        if points is not None and image.may_see(world_from_box[:3, 3], points.reach_m):
-            actor = where(points, world_from_box, stand_still=False)
-            recent.append(actor.points(torch.ones_like(actor.age_ns, dtype=torch.bool)))
+    seen = _actors_in(image, lidar_map, actors, timestamp_ns)
+    if len(seen):
+        placed = where(seen, world, stand_still=False)
+        recent.append(placed.points(torch.ones_like(placed.age_ns, dtype=torch.bool)))
     return ViewPoints.concatenate(recent), older
+
+
+def _actors_in(
+    image: Camera, lidar_map: LidarMap, actors: MovingBoxes, timestamp_ns: int
+) -> MapPoints:
+    """The points of the actors that an image may show, in the world where they are at its time."""
+    mapped = [
+        (lidar_map.actors[track.actor_id], world_from_box)
+        for track, world_from_box in actors.placed(timestamp_ns)
+        if track.actor_id in lidar_map.actors
+    ]
+    if not mapped:
+        return MapPoints.concatenate([])
+    centres = torch.stack([world_from_box[:3, 3] for _, world_from_box in mapped])
+    reach_m = torch.tensor([points.reach_m for points, _ in mapped])
+    seen = image.may_see(centres, reach_m).nonzero()[:, 0].tolist()
+    return MapPoints.concatenate([mapped[number][0].moved(mapped[number][1]) for number in seen])
 
 
 class _Projected(NamedTuple):

@@ -4,7 +4,7 @@ The street stands in the world, each moving actor in the frame of its box; metre
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import torch
@@ -13,6 +13,11 @@ from torch import Tensor
 
 from lidarpainter_models.devices import on_device
 from lidarpainter_models.scenes.tracks import remembered
+
+_CELL_SIZES = (-6, 1)
+"""Exponents of the widths of cells, 16 mm to 2 m."""
+_WIDE, _HIGH = (1 << 21) - 1, (1 << 16) - 1
+"""How many cells are told apart along x and y, and along z: at least 32 km and 1 km of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,9 +50,29 @@ class MapPoints:
         """The points marked or listed; of a slice nothing is copied."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 
+    def thinned(self, spacing_rad: float) -> "MapPoints":
+        """One point of each cell, coloured if the cell has such, in the order of the points.
+
+        Cells are cubes, as wide as the spacing at the range that their points were measured from,
+        up to a power of two: what many sweeps measured again is kept once for each such range.
+        """
+        size = (self.range_m * spacing_rad).log2().ceil().clamp(*_CELL_SIZES).long()
+        x, y, z = (self.xyz_m * torch.exp2(-size)[:, None]).floor().long().unbind(-1)
+        cell = ((x & _WIDE) << 41) | ((y & _WIDE) << 20) | ((z & _HIGH) << 4)
+        cell |= (size - _CELL_SIZES[0]) << 1
+        order = (cell | ~self.has_colour).argsort(stable=True)
+        is_first = torch.ones_like(self.has_colour)
+        is_first[1:] = cell[order].diff() != 0
+        return self.keep(order[is_first].sort().values)
+
     def to(self, device: torch.device) -> "MapPoints":
         """The same points on another device."""
         return on_device(self, device)
+
+    def moved(self, world_from_box: Float[Tensor, "4 4"]) -> "MapPoints":
+        """The points in another frame."""
+        pose = world_from_box.to(self.xyz_m)
+        return replace(self, xyz_m=self.xyz_m @ pose[:3, :3].T + pose[:3, 3])
 
     def to_arrays(self) -> dict[str, Tensor]:
         """Columns by name, for storage."""
@@ -105,6 +130,11 @@ class LidarMap:
             return self
         actors = {name: points.to(device) for name, points in self.actors.items()}
         return LidarMap(street=self.street.to(device), actors=actors)
+
+    def thinned(self, spacing_rad: float) -> "LidarMap":
+        """The map for images as coarse as that: street and actors, as `MapPoints.thinned`."""
+        actors = {name: points.thinned(spacing_rad) for name, points in self.actors.items()}
+        return LidarMap(street=self.street.thinned(spacing_rad), actors=actors)
 
     def num_street_points_near(self, place_m: Float[Tensor, "3"], radius_m: float) -> int:
         """How many points of the street are nearer than that to a place in the world."""

@@ -140,6 +140,42 @@ def test_actors_are_carried_by_their_track_and_absent_ones_left_out(camera_at, m
     assert not render_lidar(lidar_map, MovingBoxes([]), camera_at(), SECOND_NS).hit.any()
 
 
+def test_actors_beyond_the_edge_of_the_image_are_left_out(camera_at, moving_track):
+    patch = wall(0.0, left_m=1.0, right_m=-1.0, bottom_m=-1.0, top_m=1.0, spacing_m=0.05)
+    aside = replace(moving_track((8.0, 40.0, 0.0), (8.0, 40.0, 0.0)), actor_id="b")
+    ahead = moving_track((8.0, 0.0, 0.0), (8.0, 0.0, 0.0))
+    both = {ahead.actor_id: points(patch, GREEN), "b": points(patch, BLUE)}
+    images = [
+        render_lidar(street(points(whole_wall(20.0)), actors=actors), boxes, camera_at(), 0)
+        for actors, boxes in (
+            (both, MovingBoxes([ahead, aside])),
+            ({ahead.actor_id: both[ahead.actor_id]}, MovingBoxes([ahead])),
+        )
+    ]
+    assert bool((images[0].rgb[..., 1] == 1).any())
+    assert torch.equal(images[0].rgb, images[1].rgb)
+
+
+def test_a_thinned_map_looks_the_same_from_afar(camera_at):
+    sweeps = [points(whole_wall(10.0, 0.02 + 0.001 * number)) for number in range(4)]
+    whole = street(*sweeps)
+    thin = whole.thinned(0.01)
+    assert len(thin.street) < len(whole.street) / 8
+    images = [render_lidar(each, MovingBoxes([]), camera_at(), 0) for each in (whole, thin)]
+    assert images[1].hit.all()
+    assert torch.allclose(images[0].depth_m, images[1].depth_m)
+
+
+def test_a_thinned_map_keeps_what_has_a_colour_and_each_range():
+    place = [[10.0, 0.0, 0.0]] * 4
+    bare, red = points(place, has_colour=False), points(place, timestamp_ns=SECOND_NS)
+    far = points(place, BLUE, range_m=100.0)
+    thin = MapPoints.concatenate([bare, red, far]).thinned(0.01)
+    assert thin.has_colour.tolist() == [True, True]
+    assert thin.rgb_u8.tolist() == [list(RED), list(BLUE)]
+    assert thin.timestamp_ns.tolist() == [SECOND_NS, 0]
+
+
 def test_points_without_colour_hide_and_give_depth_but_are_no_hit(camera_at):
     bare = points(whole_wall(5.0), has_colour=False)
     image = render_lidar(
