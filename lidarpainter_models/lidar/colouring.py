@@ -30,7 +30,7 @@ from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.point_visibility import (
-    Neighbourhood,
+    EDGE_TOLERANCE,
     Visibility,
     box_far_ends,
     surface_visibility,
@@ -49,7 +49,6 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
-EDGE_TOLERANCE = 0.15  # a neighbour nearer or further by this share of the depth makes an edge
 BEHIND_EDGE_WEIGHT = 0.2  # weight of a sample beside a nearer surface
 RIM_WEIGHT = 0.4  # weight of a sample on the rim of a surface
 FOREIGN_LIKENESS = 30.0
@@ -130,10 +129,6 @@ BEAM_SPACING_RAD = 0.004
 """Angle between neighbouring returns: the width of a disc that closes a surface."""
 SURFACE_WINDOW_S = 0.5  # points measured this near in time to an image hide others in it
 _SURFACE_AGE_NS = round(1.1e9 * SURFACE_WINDOW_S)  # a little more: ages are rounded
-GAP_RAD = 0.012  # gaps between scan lines up to this angle are closed to the background
-HIDDEN_TOLERANCE = 0.05  # a point is behind a surface when further by this share of its depth
-EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of pose and calibration
-RIM_RAD = 0.008  # a surface that ends within this angle may show what is beyond it
 STANDING_BOX_SHARE = 0.85
 """Share of each side of a standing actor's box that hides what is behind it."""
 WIDTH_PX = 960  # images are shrunk to this width before they are sampled
@@ -286,7 +281,7 @@ def _is_shown(
 ) -> Bool[Tensor, " points"]:
     """Whether nothing known stands before each point, the recording car's own body neither."""
     cells_uv = grid.cells_of(points.pixels_uv)
-    is_shown = visible_points(cells_uv, points.depth_m, visibility, tolerance=HIDDEN_TOLERANCE)
+    is_shown = visible_points(cells_uv, points.depth_m, visibility)
     if hidden is not None:
         size = torch.tensor([grid.camera.width_px, grid.camera.height_px])
         column, row = (cells_uv * torch.tensor(hidden.shape[::-1]) // size).unbind(-1)
@@ -307,12 +302,6 @@ def _visibility(solid: PointsInView, grid: CellGrid, actors: PlacedActors) -> Vi
         solid.depth_m,
         (footprint_px / 2).round().long().clamp(max=2),
         cells,
-        Neighbourhood(
-            gap_px=max(1, round(GAP_RAD * cells.fx_px)),
-            edge_px=max(1, round(EDGE_RAD * cells.fx_px)),
-            rim_px=max(1, round(RIM_RAD * cells.fx_px)),
-            edge_tolerance=EDGE_TOLERANCE,
-        ),
         box_far_ends(boxes, cells),
     )
 

@@ -135,20 +135,19 @@ class _Grid:
         return heights
 
 
-def ground_surface(points: MapPoints, path: DrivenPath, *, cell_m: float = CELL_M) -> GroundSurface:
+def ground_surface(points: MapPoints, path: DrivenPath) -> GroundSurface:
     """Build the ground around a path from points of the street.
 
     Args:
         points: of the street, in the world; with what stands on the ground.
         path: where the recording car drove.
-        cell_m: the side of a cell.
 
     Raises:
         SceneError: no point lies near the path, or the path is longer than a grid can hold.
     """
     path_m = path.world_from_body[:, :2, 3].numpy()
     low_m, high_m = path_m.min(axis=0) - REACH_M, path_m.max(axis=0) + REACH_M
-    grid = _Grid.over(low_m, high_m, cell_m)
+    grid = _Grid.over(low_m, high_m, CELL_M)
     if grid.shape[0] * grid.shape[1] > MOST_CELLS:
         raise SceneError(
             f"the ground of a drive over {high_m[0] - low_m[0]:.0f} x {high_m[1] - low_m[1]:.0f} m "
@@ -165,11 +164,8 @@ def ground_surface(points: MapPoints, path: DrivenPath, *, cell_m: float = CELL_
     is_ground = np.abs(xyz_m[:, 2] - coarse_m) < NEAR_GROUND_M
     heights = _closed(grid.quantiles(xyz_m[is_ground], 0.5), path, grid)
     is_driven = _reached(np.isfinite(heights), grid.nearest(path_m))
-    return GroundSurface(
-        height_m=np.where(is_driven, heights, np.nan),
-        origin_m=(low_m[0], low_m[1]),
-        cell_m=cell_m,
-    )
+    heights = np.where(is_driven, heights, np.nan)
+    return GroundSurface(height_m=heights, origin_m=(low_m[0], low_m[1]))
 
 
 def _coarse_ground(

@@ -21,6 +21,11 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_splat import splat_points
 
 _FAR_M = 1e6
+EDGE_TOLERANCE = 0.15  # a neighbour nearer or further by this share of the depth makes an edge
+GAP_RAD = 0.012  # gaps between scan lines up to this angle are closed to the background
+HIDDEN_TOLERANCE = 0.05  # a point is behind a surface when further by this share of its depth
+EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of pose and calibration
+RIM_RAD = 0.008  # a surface that ends within this angle may show what is beyond it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,50 +44,38 @@ class Visibility:
     """Depth of the surface where it goes on all around the cell, 0 at its rims and beyond."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Neighbourhood:
-    """How far around a cell surfaces are looked at, in cells."""
-
-    gap_px: int
-    """To each side, for nearer surface that hides a point."""
-    edge_px: int
-    """All around, for nearer surface that a point is just beside."""
-    rim_px: int
-    """All around, for the end of the surface that a point is on."""
-    edge_tolerance: float
-    """A neighbour nearer or further by this share of the depth makes an edge."""
-
-
 def surface_visibility(
     cells_uv: Int[Tensor, "points 2"],
     depth_m: Float[Tensor, " points"],
     radius_px: Int[Tensor, " points"],
     grid: Camera,
-    around: Neighbourhood,
     box_m: Float[Tensor, "rows columns"],
 ) -> Visibility:
     """What a cloud of discs and boxes lets a camera see.
 
     The cells are pixels of `grid`; `box_m` is as `box_far_ends` gives it.
     """
+    gap_px, edge_px, rim_px = (
+        max(1, round(angle_rad * grid.fx_px)) for angle_rad in (GAP_RAD, EDGE_RAD, RIM_RAD)
+    )
     seen = splat_points(
         cells_uv, depth_m, height_px=grid.height_px, width_px=grid.width_px, radius_px=radius_px
     )
     is_surface = (seen >= 0).numpy()
     depth = np.append(depth_m.numpy(), np.float32(_FAR_M))[seen.numpy()]  # -1 is the last
     steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
-    sides = [_nearest_towards(depth, around.gap_px, *step) for step in steps]
+    sides = [_nearest_towards(depth, gap_px, *step) for step in steps]
     hidden = np.minimum(np.maximum(sides[0], sides[1]), np.maximum(sides[2], sides[3]))
-    square = np.ones((2 * around.edge_px + 1,) * 2, np.uint8)
+    square = np.ones((2 * edge_px + 1,) * 2, np.uint8)
     nearest = cv2.erode(depth, square, borderType=cv2.BORDER_REPLICATE)
-    wide = np.ones((2 * around.rim_px + 1,) * 2, np.uint8)
+    wide = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     known = np.where(is_surface, depth, np.float32(0))
     furthest = cv2.dilate(known, wide, borderType=cv2.BORDER_REPLICATE)
-    gaps = np.ones((2 * around.gap_px + 1,) * 2, np.uint8)
+    gaps = np.ones((2 * gap_px + 1,) * 2, np.uint8)
     closed = cv2.morphologyEx(is_surface.astype(np.uint8), cv2.MORPH_CLOSE, gaps)
     is_closed = cv2.erode(closed, wide) > 0
-    is_inner = is_surface & is_closed & (nearest >= depth * (1 - around.edge_tolerance))
-    is_inner &= furthest <= depth * (1 + around.edge_tolerance)
+    is_inner = is_surface & is_closed & (nearest >= depth * (1 - EDGE_TOLERANCE))
+    is_inner &= furthest <= depth * (1 + EDGE_TOLERANCE)
     return Visibility(
         hidden_from_m=torch.from_numpy(hidden),
         nearest_m=torch.from_numpy(nearest),
@@ -110,15 +103,11 @@ def box_far_ends(
 
 
 def visible_points(
-    cells_uv: Int[Tensor, "points 2"],
-    depth_m: Float[Tensor, " points"],
-    visibility: Visibility,
-    *,
-    tolerance: float,
+    cells_uv: Int[Tensor, "points 2"], depth_m: Float[Tensor, " points"], visibility: Visibility
 ) -> Bool[Tensor, " points"]:
     """Whether nothing known stands before each point."""
     column, row = cells_uv.long().unbind(-1)
-    is_open = depth_m * (1 - tolerance) <= visibility.hidden_from_m[row, column]
+    is_open = depth_m * (1 - HIDDEN_TOLERANCE) <= visibility.hidden_from_m[row, column]
     return is_open & (depth_m <= visibility.box_m[row, column])
 
 
