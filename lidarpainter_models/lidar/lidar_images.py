@@ -79,10 +79,6 @@ class ViewPoints(NamedTuple):
         rows = kept.nonzero()[:, 0]
         return ViewPoints(*(field.index_select(0, rows) for field in self))
 
-    def without(self, hidden: Bool[Tensor, " points"]) -> "ViewPoints":
-        """The same points, those that are marked at no depth, where nothing draws them."""
-        return self._replace(depth_m=torch.where(hidden, torch.inf, self.depth_m))
-
     @classmethod
     def concatenate(cls, parts: Sequence["ViewPoints"]) -> "ViewPoints":
         """All points of several parts, in their order."""
@@ -101,7 +97,7 @@ def render_lidar(
     # what stands just outside the image hides and covers pixels inside
     margin_px = max(2, round(HIDDEN_REACH_RAD * camera.fx_px))
     recent, older = _points_around(lidar_map, actors, camera, timestamp_ns, margin_px)
-    image = _image(recent, older, with_margin(camera, margin_px, margin_px), margin_px)
+    image = _image(recent, older, with_margin(camera, margin_px), margin_px)
     image = image[margin_px:-margin_px, margin_px:-margin_px]
     hit = image[..., 3] > 0
     return LidarImage(
@@ -116,12 +112,12 @@ def _image(
 ) -> Float[Tensor, "height width 5"]:
     """Recent points first, older ones where those leave the image open, then gaps closed."""
     surface = _surface(recent, camera, recent.radius_px.round())
-    recent = recent.without(_hidden(recent, surface, reach_px))
+    recent = _without_hidden(recent, surface, reach_px)
     image = _blend(recent, torch.ones_like(surface, dtype=torch.bool), camera)
     is_open = image[..., 4] == 0
     older = older.keep(_at(spread(is_open, reach_px), older))
     surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
-    older = older.without(_hidden(older, surface, reach_px))
+    older = _without_hidden(older, surface, reach_px)
     image = image + _blend(older, is_open, camera)
     return image + _fill_gaps(image[..., 4], (recent, older), camera)
 
@@ -136,15 +132,13 @@ def _points_around(
     """
     newest_ns = lidar_map.newest_age_ns(timestamp_ns)
     window_ns, reach_ns = (newest_ns + round(limit_s * 1e9) for limit_s in (WINDOW_S, REACH_S))
-    world = torch.eye(4, dtype=torch.float64)
-    where = partial(_Projected.of, camera=camera, timestamp_ns=timestamp_ns, margin_px=margin_px)
-    street = where(lidar_map.street, world, stand_still=True)
+    where = partial(_Projected.of, camera=camera, time_ns=timestamp_ns, margin_px=margin_px)
+    street = where(lidar_map.street, stand_still=True)
     recent = [street.points(street.age_ns <= window_ns)]
     older = street.points((street.age_ns > window_ns) & (street.age_ns <= reach_ns))
-    image = with_margin(camera, margin_px, margin_px)
-    seen = _actors_in(image, lidar_map, actors, timestamp_ns)
+    seen = _actors_in(with_margin(camera, margin_px), lidar_map, actors, timestamp_ns)
     if len(seen):
-        placed = where(seen, world, stand_still=False)
+        placed = where(seen, stand_still=False)
         recent.append(placed.points(torch.ones_like(placed.age_ns, dtype=torch.bool)))
     return ViewPoints.concatenate(recent), older
 
@@ -167,7 +161,7 @@ def _actors_in(
 
 
 class _Projected(NamedTuple):
-    """Points of the street or an actor in the image: which, and where."""
+    """Points of the street or of actors in the image: which, and where."""
 
     body: MapPoints
     rows: Int[Tensor, " points"]
@@ -178,24 +172,14 @@ class _Projected(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        body: MapPoints,
-        world_from_body: Float[Tensor, "4 4"],
-        *,
-        stand_still: bool,
-        camera: Camera,
-        timestamp_ns: int,
-        margin_px: int,
+        cls, body: MapPoints, *, stand_still: bool, camera: Camera, time_ns: int, margin_px: int
     ) -> "_Projected":
-        """Bring points into the image and its margin; those outside are dropped."""
+        """Bring points of the world into the image and its margin; those outside are dropped."""
+        seen_from = camera.camera_from_world
         rows, positions_uv, depth_m = read_in_image(
-            body.xyz_m,
-            camera.camera_from_world @ world_from_body.to(torch.float64),
-            camera,
-            stand_still=stand_still,
-            margin_px=margin_px,
+            body.xyz_m, seen_from, camera, stand_still=stand_still, margin_px=margin_px
         )
-        age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()
+        age_ns = (body.timestamp_ns.index_select(0, rows) - time_ns).abs()
         focal_px = (camera.fx_px + camera.fy_px) / 2
         return cls(body, rows, positions_uv, depth_m, age_ns, focal_px)
 
@@ -216,12 +200,12 @@ class _Projected(NamedTuple):
         )
 
 
-def _hidden(
+def _without_hidden(
     points: ViewPoints, surface: Float[Tensor, "height width"], reach_px: int
-) -> Bool[Tensor, " points"]:
-    """Whether nearer surface surrounds a point in its neighbourhood."""
-    behind = curtain(surface, reach_px)
-    return _at(behind, points) < points.depth_m * (1 - HIDDEN_TOLERANCE)
+) -> ViewPoints:
+    """The same points, at no depth where nearer surface surrounds them: nothing draws those."""
+    is_hidden = _at(curtain(surface, reach_px), points) < points.depth_m * (1 - HIDDEN_TOLERANCE)
+    return points._replace(depth_m=torch.where(is_hidden, torch.inf, points.depth_m))
 
 
 def _blend(

@@ -205,7 +205,7 @@ def read_in_image(
     """
     if stand_still and camera.shutter is not None and camera.shutter.is_rolling:
         return read_inside(xyz_m, camera.packed(), margin_px, NEAR_M, READ_ROUNDS)
-    image = with_margin(camera, margin_px, margin_px)
+    image = with_margin(camera, margin_px)
     lens = torch.tensor(
         [[image.fx_px, 0, image.cx_px], [0, image.fy_px, image.cy_px], [0, 0, 1]],
         dtype=torch.float64,
@@ -215,12 +215,12 @@ def read_in_image(
     )
 
 
-def with_margin(camera: Camera, aside_px: int, above_px: int) -> Camera:
+def with_margin(camera: Camera, margin_px: int) -> Camera:
     """The same view with so many pixels more on each side."""
     return replace(
         camera,
-        cx_px=camera.cx_px + aside_px,
-        cy_px=camera.cy_px + above_px,
-        width_px=camera.width_px + 2 * aside_px,
-        height_px=camera.height_px + 2 * above_px,
+        cx_px=camera.cx_px + margin_px,
+        cy_px=camera.cy_px + margin_px,
+        width_px=camera.width_px + 2 * margin_px,
+        height_px=camera.height_px + 2 * margin_px,
     )
