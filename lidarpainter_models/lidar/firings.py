@@ -144,24 +144,23 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
     beam = beams_of(seen, sensor)
     world_from_sensor = lidar.world_from_sensor(torch.from_numpy(seen.time_ns))
     direction = torch.from_numpy(seen.points_m / range_m[:, None])
-    rows = torch.arange(len(range_m))
     returned = unanswered_rays(
         world_from_sensor, direction, torch.from_numpy(seen.time_ns), torch.from_numpy(beam)
     )
     returned = replace(
         returned,
         range_m=torch.from_numpy(range_m),
-        intensity=torch.from_numpy(seen.intensity)[rows].float(),
+        intensity=torch.from_numpy(seen.intensity).float(),
         is_returned=torch.ones(len(range_m), dtype=torch.bool),
     )
     if not lidar.tells_lost:
         return returned
-    missing = _missing(seen, beam, sensor)
+    beam, head_deg, time_ns = _missing(seen, beam, sensor)
     absent = unanswered_rays(
-        lidar.world_from_sensor(torch.from_numpy(missing.time_ns)),
-        torch.from_numpy(sensor.directions(missing.beam, missing.head_deg)),
-        torch.from_numpy(missing.time_ns),
-        torch.from_numpy(missing.beam),
+        lidar.world_from_sensor(torch.from_numpy(time_ns)),
+        torch.from_numpy(sensor.directions(beam, head_deg)),
+        torch.from_numpy(time_ns),
+        torch.from_numpy(beam),
     )
     return SweepRays.joined([returned, absent])
 
@@ -195,17 +194,10 @@ def unanswered_rays(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Missing:
-    """Firings that nothing came back of."""
-
-    beam: Int[np.ndarray, " rays"]
-    head_deg: Float[np.ndarray, " rays"]
-    time_ns: Int[np.ndarray, " rays"]
-
-
-def _missing(seen: SeenPoints, beam: np.ndarray, sensor: LidarSensor) -> _Missing:
-    """The steps of each beam that hold no point.
+def _missing(
+    seen: SeenPoints, beam: np.ndarray, sensor: LidarSensor
+) -> tuple[Int[np.ndarray, " rays"], Float[np.ndarray, " rays"], Int[np.ndarray, " rays"]]:
+    """Beam, azimuth of the head and time of the steps of each beam that hold no point.
 
     Steps are counted from where most points say that they begin; their times go with azimuth.
     """
@@ -224,8 +216,7 @@ def _missing(seen: SeenPoints, beam: np.ndarray, sensor: LidarSensor) -> _Missin
     empty_step, empty_beam = np.nonzero(~is_met)
     turn_deg = (empty_step + begins) * sensor.step_deg
     empty_head = first + turn_deg if sensor.turns_left else last - turn_deg
-    time_ns = _step_times(step, seen.time_ns[known], sensor)[empty_step]
-    return _Missing(beam=empty_beam, head_deg=empty_head, time_ns=time_ns)
+    return empty_beam, empty_head, _step_times(step, seen.time_ns[known], sensor)[empty_step]
 
 
 def _step_times(step: np.ndarray, time_ns: np.ndarray, sensor: LidarSensor) -> np.ndarray:
@@ -238,5 +229,4 @@ def _step_times(step: np.ndarray, time_ns: np.ndarray, sensor: LidarSensor) -> n
     sums = np.add.reduceat((time_ns[order] - time_ns.min()).astype(float), starts)
     means = sums / np.diff([*starts, len(order)])
     steps = np.arange(sensor.steps)
-    found: np.ndarray = np.interp(steps, known, means).astype(np.int64) + time_ns.min()
-    return found
+    return np.interp(steps, known, means).astype(np.int64) + time_ns.min()

@@ -86,7 +86,7 @@ def _compared(hub: Hub, values: Float[np.ndarray, "5"], level: int, stride: int)
     cameras = [_assumed(image, values) for image in hub.images]
     hub_depth_m = depths_before(points, cameras[hub.own])
     seen = [
-        seen_contrasts(points, camera, image.contrast.levels, image.nearest_m, level, hub_depth_m)
+        seen_contrasts(points, camera, image.contrasts, image.nearest_m, level, hub_depth_m)
         for image, camera in zip(hub.images, cameras, strict=True)
     ]
     is_seen = np.array([one.is_seen for one in seen])

@@ -38,37 +38,23 @@ _CALM = 0.02
 """Deviation of plain surfaces: less is noise."""
 
 
-@dataclass(frozen=True, slots=True)
-class ContrastImage:
-    """One image at all levels."""
-
-    levels: np.ndarray
-    """(levels, height, width, 3) float32: contrast and its derivatives along u and v."""
-
-    @classmethod
-    def of(cls, rgb_u8: np.ndarray) -> "ContrastImage":
-        """The contrasts of an image."""
-        grey = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-        blurs_px = [_blur_px(level) for level in range(NUM_LEVELS + _SURROUNDINGS)]
-        light = np.log(grey + _DARKEST)
-        blurred = [cv2.GaussianBlur(light, (0, 0), blur_px) for blur_px in blurs_px]
-        levels = np.empty((NUM_LEVELS, *grey.shape, 3), np.float32)
-        for level in range(NUM_LEVELS):
-            wide = level + _SURROUNDINGS
-            band = blurred[level] - blurred[wide]
-            spread = np.sqrt(cv2.GaussianBlur(band**2, (0, 0), blurs_px[wide]))
-            contrast = band / (spread + _CALM)
-            levels[level, ..., 0] = contrast
-            for number, axis in enumerate(_AXES, start=1):
-                levels[level, ..., number] = cv2.Sobel(contrast, cv2.CV_32F, *axis, scale=1 / 8)
-        return cls(levels)
-
-
-_AXES = ((1, 0), (0, 1))
-
-
-def _blur_px(level: int) -> float:
-    return FINEST_PX * 2.0 ** (level / LEVELS_PER_OCTAVE)
+def contrasts_of(rgb_u8: np.ndarray) -> Float[np.ndarray, "levels height width 3"]:
+    """An image at all levels: contrast and its derivatives along u and v, float32."""
+    grey = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    scales = range(NUM_LEVELS + _SURROUNDINGS)
+    blurs_px = [FINEST_PX * 2.0 ** (level / LEVELS_PER_OCTAVE) for level in scales]
+    light = np.log(grey + _DARKEST)
+    blurred = [cv2.GaussianBlur(light, (0, 0), blur_px) for blur_px in blurs_px]
+    levels = np.empty((NUM_LEVELS, *grey.shape, 3), np.float32)
+    for level in range(NUM_LEVELS):
+        wide = level + _SURROUNDINGS
+        band = blurred[level] - blurred[wide]
+        spread = np.sqrt(cv2.GaussianBlur(band**2, (0, 0), blurs_px[wide]))
+        contrast = band / (spread + _CALM)
+        levels[level, ..., 0] = contrast
+        for number, axis in enumerate(((1, 0), (0, 1)), start=1):
+            levels[level, ..., number] = cv2.Sobel(contrast, cv2.CV_32F, *axis, scale=1 / 8)
+    return levels
 
 
 WIDTH_PX = 480
@@ -87,7 +73,8 @@ class HubImage:
     """Position among the camera's images."""
     camera: Camera
     twist_per_s: Float[np.ndarray, "6"]
-    contrast: ContrastImage
+    contrasts: Float[np.ndarray, "levels height width 3"]
+    """As of `contrasts_of`."""
     standing: Float[Tensor, "points 3"]
     """Points of the frame outside moving boxes, in the world."""
     depth_m: Float[np.ndarray, "height width"]
@@ -201,7 +188,7 @@ def _image(
         place=place,
         camera=camera,
         twist_per_s=shutter.twist_per_s.numpy(),
-        contrast=ContrastImage.of(rgb),
+        contrasts=contrasts_of(rgb),
         standing=returns.standing,
         depth_m=depth_m,
         nearest_m=cv2.erode(far_m.astype(np.float32), np.ones((5, 5), np.uint8)),

@@ -65,12 +65,8 @@ class SeenPoints:
     @property
     def elevation_deg(self) -> Float[np.ndarray, " points"]:
         """Above the sensor's own horizon."""
-        return _elevation_deg(self.points_m)
-
-
-def _elevation_deg(points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-    range_m = np.maximum(np.linalg.norm(points_m, axis=1), 1e-6)
-    return np.degrees(np.arcsin(np.clip(points_m[:, 2] / range_m, -1, 1)))
+        range_m = np.maximum(np.linalg.norm(self.points_m, axis=1), 1e-6)
+        return np.degrees(np.arcsin(np.clip(self.points_m[:, 2] / range_m, -1, 1)))
 
 
 def points_seen(
@@ -81,12 +77,9 @@ def points_seen(
     different, places = torch.unique(times_ns, return_inverse=True)
     poses = path.driven_on(different).world_from_body @ lidar_from_sensor
     sensor_from_world = invert_rigid(poses)[places]
-    xyz_m = points.xyz_m.double()
-    turned = (sensor_from_world[:, :3, :3] @ xyz_m[:, :, None])[..., 0] + sensor_from_world[
-        :, :3, 3
-    ]
+    turned = (sensor_from_world[:, :3, :3] @ points.xyz_m.double()[:, :, None])[..., 0]
     return SeenPoints(
-        points_m=turned.numpy(),
+        points_m=(turned + sensor_from_world[:, :3, 3]).numpy(),
         time_ns=times_ns.numpy(),
         ring=points.ring.numpy().astype(np.int64),
         intensity=points.intensity.numpy(),

@@ -84,11 +84,6 @@ class LidarSensor:
         return len(self.elevation_deg)
 
     @property
-    def num_rays(self) -> int:
-        """How many rays a sweep has."""
-        return self.num_beams * self.steps
-
-    @property
     def step_deg(self) -> float:
         """Azimuth between one firing of a beam and the next."""
         return (self.azimuths_deg[1] - self.azimuths_deg[0]) / self.steps
@@ -164,13 +159,13 @@ def _is_number(value: Any) -> bool:  # noqa: ANN401 - what a JSON file holds
     return is_number and abs(value) < 1e9
 
 
-def _evenly(highest_deg: float, step_deg: float, count: int) -> tuple[float, ...]:
-    return tuple(round(highest_deg - step_deg * beam, 4) for beam in range(count))
-
-
 def _runs(*runs: tuple[float, float, int]) -> tuple[float, ...]:
     """Elevations from runs of equally spaced beams: the highest, the spacing, how many."""
-    return tuple(one for run in runs for one in _evenly(*run))
+    return tuple(
+        round(highest_deg - step_deg * beam, 4)
+        for highest_deg, step_deg, count in runs
+        for beam in range(count)
+    )
 
 
 _PANDAR64_DEG = (
@@ -193,10 +188,7 @@ PRESETS: dict[str, LidarSensor] = {
     sensor.name: sensor
     for sensor in (
         LidarSensor(
-            name="hdl-32e",
-            elevation_deg=_evenly(10.667, 4 / 3, 32),
-            steps=2170,
-            max_range_m=100.0,
+            name="hdl-32e", elevation_deg=_runs((10.667, 4 / 3, 32)), steps=2170, max_range_m=100.0
         ),
         LidarSensor(
             name="hdl-64e",
@@ -206,7 +198,7 @@ PRESETS: dict[str, LidarSensor] = {
             divergence_rad=0.002,
         ),
         LidarSensor(
-            name="vlp-16", elevation_deg=_evenly(15.0, 2.0, 16), steps=1808, max_range_m=100.0
+            name="vlp-16", elevation_deg=_runs((15.0, 2.0, 16)), steps=1808, max_range_m=100.0
         ),
         LidarSensor(
             name="pandar64",
@@ -223,13 +215,13 @@ PRESETS: dict[str, LidarSensor] = {
         ),
         LidarSensor(
             name="at128",
-            elevation_deg=_evenly(12.7, 0.2, 128),
+            elevation_deg=_runs((12.7, 0.2, 128)),
             steps=1200,
             azimuths_deg=(-60.0, 60.0),
         ),
         LidarSensor(
             name="os1-128",
-            elevation_deg=_evenly(22.5, 45 / 127, 128),
+            elevation_deg=_runs((22.5, 45 / 127, 128)),
             steps=1024,
             min_range_m=0.5,
             max_range_m=170.0,

@@ -91,7 +91,7 @@ def replace_poses(scene, lidar_from_lidar):
 def test_a_sweep_can_be_fired_again_from_where_it_was(scene, lidar):
     sweep = scene.sweeps[1]
     rays = lidar.rays(sweep.timestamp_ns)
-    assert len(rays) == lidar.sensor.num_rays
+    assert len(rays) == lidar.sensor.num_beams * lidar.sensor.steps
     middle = (rays.time_ns - sweep.timestamp_ns).abs() < 1_000_000
     where = sweep.world_from_lidar[:3, 3]
     assert torch.allclose(rays.origin_m[middle], where.expand(int(middle.sum()), 3), atol=0.05)

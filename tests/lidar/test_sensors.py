@@ -29,7 +29,7 @@ BEAMS = {
 
 def test_presets_have_the_beams_of_their_names():
     assert {name: sensor.num_beams for name, sensor in PRESETS.items()} == BEAMS
-    assert PRESETS["pandar64"].num_rays == 115_200
+    assert PRESETS["pandar64"].steps == 1800
     for sensor in PRESETS.values():
         assert sorted(sensor.elevation_deg, reverse=True) == list(sensor.elevation_deg)
 

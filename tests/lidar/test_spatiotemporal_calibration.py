@@ -9,7 +9,7 @@ import torch
 from toy_street import ToyStreet
 
 from lidarpainter_models.geometry.cameras import Shutter
-from lidarpainter_models.lidar.hub_images import ContrastImage
+from lidarpainter_models.lidar.hub_images import contrasts_of
 from lidarpainter_models.lidar.spatiotemporal_calibration import (
     Found,
     believed,
@@ -62,7 +62,7 @@ def test_what_cannot_be_told_is_named(num_frames, speed_mps, untold):
 
 def test_contrast_does_not_see_exposure():
     rgb = np.random.default_rng(0).integers(60, 120, (64, 64, 3)).astype(np.uint8)
-    dark, bright = (ContrastImage.of(image).levels[3] for image in (rgb, 2 * rgb))
+    dark, bright = (contrasts_of(image)[3] for image in (rgb, 2 * rgb))
     assert np.allclose(dark, bright, atol=0.1)  # black is not quite black
 
 
