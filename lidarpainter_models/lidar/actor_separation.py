@@ -75,8 +75,7 @@ def near_actors(
     order = order[torch.argsort(rows[order], stable=True)]
     is_first = torch.ones_like(rows, dtype=torch.bool)
     is_first[1:] = rows[order][1:] != rows[order][:-1]
-    chosen = order[is_first]
-    return near.keep(chosen)
+    return near.keep(order[is_first])
 
 
 def height_above_ground(

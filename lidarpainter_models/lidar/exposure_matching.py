@@ -6,6 +6,7 @@ the cameras are joined by weighted least squares over all pairs that share point
 """
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lidarpainter_models.kernels.colour_sampling import BestSamples
 
@@ -82,8 +83,9 @@ def _camera_gains(
                 values.append(np.median(ratios, axis=0))
                 weights.append(np.sqrt(len(ratios)))
     gains = np.zeros((num_cameras, 3))
-    joined = _joined_to_first(rows, num_cameras)
-    free = np.flatnonzero(joined[1:]) + 1
+    are_compared = np.array(rows).reshape(-1, num_cameras) != 0
+    _, group = connected_components(are_compared.T.astype(int) @ are_compared)
+    free = np.flatnonzero(group[1:] == group[0]) + 1
     if len(free):
         scale = np.array(weights)[:, None]
         system, right = np.array(rows)[:, free] * scale, np.array(values) * scale
@@ -99,15 +101,3 @@ def _ratios(
     both = np.flatnonzero(in_first.any(1) & in_second.any(1))
     best_first, best_second = in_first[both].argmax(1), in_second[both].argmax(1)
     return log_rgb[both, best_second] - log_rgb[both, best_first]
-
-
-def _joined_to_first(rows: list[np.ndarray], num_cameras: int) -> np.ndarray:
-    """Which cameras are linked to camera 0 by compared pairs."""
-    joined = np.zeros(num_cameras, bool)
-    joined[0] = True
-    for _ in range(num_cameras):
-        for row in rows:
-            members = row != 0
-            if joined[members].any():
-                joined[members] = True
-    return joined

@@ -17,7 +17,7 @@ from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.timed_poses import moved_meanwhile, poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
-from lidarpainter_models.scenes.frame_content import FrameContent, SourceSweep
+from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord
 from lidarpainter_models.scenes.rewriting import header_of, write_anew
 from lidarpainter_models.scenes.schema import LABELLED, LOCALISED, NO_POSES, POSES
@@ -72,24 +72,15 @@ class _Moved:
         return replace(
             content,
             world_from_ego=self._one(content.timestamp_ns, content.world_from_ego),
-            images=[
-                replace(
-                    image,
-                    record=replace(
-                        image.record,
-                        camera=replace(
-                            image.record.camera,
-                            world_from_camera=self._one(
-                                image.record.timestamp_ns, image.record.camera.world_from_camera
-                            ),
-                        ),
-                    ),
-                )
-                for image in content.images
-            ],
+            images=[self._image(image) for image in content.images],
             sweeps=[self._sweep(sweep) for sweep in content.sweeps],
             boxes=[self._box(box) for box in content.boxes],
         )
+
+    def _image(self, image: SourceImage) -> SourceImage:
+        record = image.record
+        pose = self._one(record.timestamp_ns, record.camera.world_from_camera)
+        return replace(image, record=replace(record, camera=record.camera.refined(pose)))
 
     def _sweep(self, sweep: SourceSweep) -> SourceSweep:
         times_ns = sweep.timestamp_ns + sweep.points.time_offset_ns.numpy().astype(np.int64)

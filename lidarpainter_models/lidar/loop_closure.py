@@ -7,6 +7,7 @@ World: x forward, y left, z up; metres.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -47,14 +48,16 @@ def with_loops_closed(path: DrivenPath, frames: Sequence[SweptFrame]) -> DrivenP
     graph = registration.PoseGraph()
     for pose in poses:
         graph.nodes.append(registration.PoseGraphNode(pose.numpy().copy()))
-    for number in range(len(poses) - 1):
-        step = (invert_rigid(poses[number + 1]) @ poses[number]).numpy()
-        edge = registration.PoseGraphEdge(number, number + 1, step, STEP_INFORMATION, False)
-        graph.edges.append(edge)
-    for first, second, first_from_second in loops:
-        back = np.linalg.inv(first_from_second)
-        edge = registration.PoseGraphEdge(first, second, back, LOOP_INFORMATION, False)
-        graph.edges.append(edge)
+    edges = [
+        (number, number + 1, (invert_rigid(after) @ before).numpy(), STEP_INFORMATION)
+        for number, (before, after) in enumerate(pairwise(poses))
+    ]
+    edges += [
+        (first, second, np.linalg.inv(first_from_second), LOOP_INFORMATION)
+        for first, second, first_from_second in loops
+    ]
+    for edge in edges:
+        graph.edges.append(registration.PoseGraphEdge(*edge, False))
     registration.global_optimization(
         graph,
         registration.GlobalOptimizationLevenbergMarquardt(),

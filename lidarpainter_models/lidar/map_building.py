@@ -6,7 +6,7 @@ one another. When a point was measured stays with it: which points an image may 
 they are then, is decided when one is rendered. Colours come from the given images alone.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -89,10 +89,8 @@ def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMa
     tracks = [track for track in scene.tracks if track.is_moving]
     taken = [sweep for sweep in scene.sweeps if sweep.frame_index in set(split_frames)]
     sweeps = [_place_sweep(scene, sweep, tracks) for sweep in taken]
-    are_new = showing_more(
-        [sweep.lidar_name for sweep in taken],
-        [sweep.timestamp_ns for sweep in taken],
-        [sweep.world_from_lidar for sweep in taken],
+    are_new = _show_more(
+        (sweep.lidar_name, sweep.timestamp_ns, sweep.world_from_lidar) for sweep in taken
     )
     street_parts = [placed.away for placed, is_new in zip(sweeps, are_new, strict=True) if is_new]
     ground = _ground(street_parts)
@@ -108,19 +106,18 @@ def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMa
     return LidarMap(street=street, actors=actors)
 
 
-def showing_more(
-    sensors: Sequence[str], times_ns: Sequence[int], poses: Sequence[Float[Tensor, "4 4"]]
-) -> list[bool]:
-    """Which poses show more of the street than those before of their sensor; in order of time."""
+def _show_more(poses: Iterable[tuple[str, int, Float[Tensor, "4 4"]]]) -> list[bool]:
+    """Which poses (sensor, time, pose) show more of the street than those before of their sensor.
+
+    They come in order of time.
+    """
     last: dict[str, tuple[int, Float[Tensor, 3]]] = {}
     are_new = []
-    for sensor, time_ns, pose in zip(sensors, times_ns, poses, strict=True):
+    for sensor, time_ns, pose in poses:
         place = pose[:3, 3]
-        is_new = sensor not in last
-        if not is_new:
-            before_ns, before = last[sensor]
-            moved_m = float((place - before).norm())
-            is_new = moved_m >= LEAST_WAY_M or time_ns - before_ns >= MOST_PAUSE_NS
+        before_ns, before = last.get(sensor, (time_ns - MOST_PAUSE_NS, place))
+        moved_m = float((place - before).norm())
+        is_new = moved_m >= LEAST_WAY_M or time_ns - before_ns >= MOST_PAUSE_NS
         if is_new:
             last[sensor] = (time_ns, place)
         are_new.append(is_new)
@@ -129,10 +126,8 @@ def showing_more(
 
 def views_showing_more(views: Sequence[View]) -> list[View]:
     """Views that show more of the street than those before of their camera; in order of time."""
-    are_new = showing_more(
-        [view.key[1] for view in views],
-        [view.timestamp_ns for view in views],
-        [view.camera.world_from_camera for view in views],
+    are_new = _show_more(
+        (view.key[1], view.timestamp_ns, view.camera.world_from_camera) for view in views
     )
     return [view for view, is_new in zip(views, are_new, strict=True) if is_new]
 

@@ -117,8 +117,7 @@ class _Ground:
     def at(self, points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """Below each point; where nothing is known very high, so that nothing stands on it."""
         cells = self._cells(points_m, self._last)
-        heights: np.ndarray = self._height_m[cells[:, 0], cells[:, 1]]
-        return heights
+        return self._height_m[cells[:, 0], cells[:, 1]]
 
     def _cells(self, points_m: np.ndarray, last: np.ndarray) -> np.ndarray:
         cells = np.floor(points_m[:, :2] / CELL_M).astype(np.int64)

@@ -207,10 +207,7 @@ class _Odometry:
 
 def swept_at(turn: Turn, path: DrivenPath, pose: Float[Tensor, "4 4"]) -> SweptFrame:
     """The planes of a turn in the world of a path."""
-    everything = turn.at(path)
-    return SweptFrame.of(
-        everything, pose[:3, 3].numpy(), turn.time_ns, lambda found: np.ones(len(found), dtype=bool)
-    )
+    return SweptFrame.of(turn.at(path), pose[:3, 3].numpy(), turn.time_ns)
 
 
 def _settled(turns: Sequence[Turn], path: DrivenPath) -> DrivenPath:

@@ -97,9 +97,9 @@ class SweptFrame:
         xyz_m: Float[np.ndarray, "points 3"],
         centre_m: Float[np.ndarray, "3"],
         time_ns: int,
-        stands: Callable[[Float[np.ndarray, "points 3"]], Bool[np.ndarray, " points"]],
+        stands: Callable[[np.ndarray], Bool[np.ndarray, " points"]] | None = None,
     ) -> "SweptFrame":
-        """Find the planes among points in range of a place; only what `stands` is used."""
+        """Find the planes among points in range of a place; only what `stands`, or all, is used."""
         import open3d
 
         range_m = np.linalg.norm(xyz_m - centre_m, axis=1)
@@ -113,7 +113,7 @@ class SweptFrame:
         variances, axes = np.linalg.eigh(np.asarray(cloud.covariances).reshape(-1, 3, 3))
         thickness, width, length = np.sqrt(np.maximum(variances, 0.0)).T
         is_thin, is_wide = thickness <= MAX_ROUGHNESS * width, width >= MAX_ROUGHNESS * length
-        is_used = stands(points_m)
+        is_used = np.ones(len(points_m), bool) if stands is None else stands(points_m)
         standing = np.flatnonzero(is_used)
         return cls(
             time_ns=time_ns,

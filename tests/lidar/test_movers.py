@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_street import swept_street
 
 from lidarpainter_models.checks.seen_space import SeenSpace
 from lidarpainter_models.errors import SceneError
@@ -13,17 +14,9 @@ from lidarpainter_models.lidar.mover_tracks import tracked
 from lidarpainter_models.lidar.movers import box_of, find_movers, unboxed
 from lidarpainter_models.lidar.moving_points import Clump
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
-from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigLidar
+from lidarpainter_models.synthetic import write_street
 
-STREET = SyntheticStreetConfig(
-    seed=12,
-    num_frames=12,
-    width_px=64,
-    height_px=36,
-    cameras=DEFAULT_CAMERAS[:1],
-    lidar=RigLidar(columns=900),
-)
+STREET = swept_street(seed=12, num_frames=12)
 FRAME_NS = 100_000_000
 CAR_M = np.array([4.2, 1.8, 1.5])
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from tiny_street import swept_street
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.driven_paths import DrivenPath
@@ -16,17 +17,9 @@ from lidarpainter_models.lidar.odometry import drive_of, path_difference
 from lidarpainter_models.lidar.sweep_registration import SweptFrame
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
 from lidarpainter_models.scenes.schema import LOCALISED, POSES
-from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
-from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigLidar
+from lidarpainter_models.synthetic import write_street
 
-STREET = SyntheticStreetConfig(
-    seed=11,
-    num_frames=8,
-    width_px=64,
-    height_px=36,
-    cameras=DEFAULT_CAMERAS[:1],
-    lidar=RigLidar(columns=900),
-)
+STREET = swept_street(seed=11, num_frames=8)
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +132,6 @@ def lap(*, drift):
     return DrivenPath(timestamps_ns=times_ns, world_from_body=torch.stack(poses))
 
 
-def everything(points_m):
-    """Nothing moves in the yard."""
-    return np.ones(len(points_m), dtype=bool)
-
-
 def seen_along(true, told):
     """What is seen from true poses, where it is taken to be by those that are told."""
     points = torch.from_numpy(yard())
@@ -154,7 +142,7 @@ def seen_along(true, told):
         moved = there @ invert_rigid(here)
         own = (points @ moved[:3, :3].T + moved[:3, 3]).numpy()
         centre_m = there[:3, 3].numpy()
-        frames.append(SweptFrame.of(own, centre_m, number, everything))
+        frames.append(SweptFrame.of(own, centre_m, number))
     return frames
 
 

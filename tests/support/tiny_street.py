@@ -50,6 +50,18 @@ def tiny_street(seed=SEED, **changes):
     return SyntheticStreetConfig(**(chosen | changes))
 
 
+def swept_street(seed, num_frames):
+    """One small camera, and a LiDAR whose sweeps are what matters."""
+    return SyntheticStreetConfig(
+        seed=seed,
+        num_frames=num_frames,
+        width_px=64,
+        height_px=36,
+        cameras=DEFAULT_CAMERAS[:1],
+        lidar=RigLidar(columns=900),
+    )
+
+
 def reconstructed(tiny_run, *words):
     """`reconstruct` of the tiny street, with other words behind."""
     return succeed("reconstruct", SCENE, *TINY, *words, store=tiny_run.store)
