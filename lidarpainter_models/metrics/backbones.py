@@ -8,6 +8,7 @@ file that the user supplies; which published file it is, its SHA-256 says.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -17,6 +18,7 @@ from torch.nn import functional
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.storage.whole_files import sha256_of
 
+Network = TypeVar("Network", bound=nn.Module)
 VGG16_CHANNELS = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
 """Channels and convolutions of every block; a max-pool stands between blocks."""
 FIRE_CHANNELS = {
@@ -165,16 +167,24 @@ def load_stack(path: Path, backbone: Backbone) -> FeatureStack:
     """
     state = read_tensors(path, backbone.name)
     named = {key.removeprefix("features."): value for key, value in state.items()}
-    stack = backbone.build()
-    for name, wanted in stack.state_dict().items():
-        if name not in named or named[name].shape != wanted.shape:
-            found = tuple(named[name].shape) if name in named else "none"
+    return frozen(backbone.build(), named, f"{path} does not hold the features of {backbone.name}")
+
+
+def frozen(network: Network, tensors: Mapping[str, Tensor], complaint: str) -> Network:
+    """A network with those of the tensors that it has by name, in place; not to be trained.
+
+    Raises:
+        WeightsError: a tensor is missing or has another shape; begins with the complaint.
+    """
+    wanted = {n: t for n, t in network.state_dict().items() if "num_batches" not in n}
+    for name, tensor in wanted.items():
+        found = tuple(tensors[name].shape) if name in tensors else "none"
+        if found != tuple(tensor.shape):
             raise WeightsError(
-                f"{path} does not hold the features of {backbone.name}: tensor {name!r} has shape "
-                f"{found}, expected {tuple(wanted.shape)}"
+                f"{complaint}: tensor {name!r} has shape {found}, expected {tuple(tensor.shape)}"
             )
-    stack.load_state_dict({name: named[name].float() for name in stack.state_dict()})
-    return stack.eval().requires_grad_(requires_grad=False)
+    network.load_state_dict({name: tensors[name].float() for name in wanted}, strict=False)
+    return network.eval().requires_grad_(requires_grad=False)
 
 
 CHANNEL_MEAN_BGR = (103.939, 116.779, 123.68)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.metrics.backbones import read_tensors
+from lidarpainter_models.metrics.backbones import frozen, read_tensors
 from lidarpainter_models.storage.whole_files import sha256_of
 
 PUBLISHED = "6726825d"
@@ -170,11 +170,8 @@ class Inception(nn.Module):
         self.Conv2d_2b_3x3 = Convolution(32, 64, (3, 3), pads=True)
         self.Conv2d_3b_1x1 = Convolution(64, 80, (1, 1), pads=False)
         self.Conv2d_4a_3x3 = Convolution(80, 192, (3, 3), pads=False)
-        self.Mixed_5b, self.Mixed_5c, self.Mixed_5d = (
-            _small(192, 32),
-            _small(256, 64),
-            _small(288, 64),
-        )
+        self.Mixed_5b = _small(192, 32)
+        self.Mixed_5c, self.Mixed_5d = _small(256, 64), _small(288, 64)
         self.Mixed_6a = Mixed(288, [[Layer("branch3x3", 384, (3, 3))], _DOUBLE])
         self.Mixed_6b, self.Mixed_6c, self.Mixed_6d = _seven(128), _seven(160), _seven(160)
         self.Mixed_6e = _seven(192)
@@ -221,7 +218,7 @@ def _as_bytes(image: Float[Tensor, "height width 3"]) -> Float[Tensor, "1 3 299 
 
 
 def load_inception(path: Path, device: torch.device | None = None) -> Inception:
-    """A frozen network with the published weights.
+    """A frozen network with the published weights; those of the classifier are left out.
 
     Raises:
         WeightsError: the file is missing, unreadable, or not the published one.
@@ -233,23 +230,5 @@ def load_inception(path: Path, device: torch.device | None = None) -> Inception:
             f"{path} is not the published Inception of FID: its SHA-256 begins with "
             f"{digest[:8]}, expected {PUBLISHED} (pt_inception-2015-12-05-{PUBLISHED}.pth)"
         )
-    return inception_of(state, path).to(device)
-
-
-def inception_of(state: dict[str, Tensor], path: Path) -> Inception:
-    """A frozen network with the tensors of a file; those of the classifier are left out.
-
-    Raises:
-        WeightsError: a tensor is missing or has another shape.
-    """
-    network = Inception()
-    wanted = {n: t for n, t in network.state_dict().items() if "num_batches" not in n}
-    for name, tensor in wanted.items():
-        found = tuple(state[name].shape) if name in state else "none"
-        if found != tuple(tensor.shape):
-            raise WeightsError(
-                f"{path} does not hold the Inception of FID: tensor {name!r} has shape {found}, "
-                f"expected {tuple(tensor.shape)}"
-            )
-    network.load_state_dict({name: state[name].float() for name in wanted}, strict=False)
-    return network.eval().requires_grad_(requires_grad=False)
+    network = frozen(Inception(), state, f"{path} does not hold the Inception of FID")
+    return network.to(device)

@@ -10,7 +10,7 @@ from scipy.linalg import sqrtm
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.metrics import inception as module
 from lidarpainter_models.metrics.fid import frechet_distance, kernel_distance
-from lidarpainter_models.metrics.inception import Inception, inception_of, load_inception
+from lidarpainter_models.metrics.inception import Inception, load_inception
 
 NUM_PARAMETERS = 21_785_568
 """Of the published network without its classifier: 23,834,568 less 1,000 classes of 2,049."""
@@ -142,8 +142,9 @@ def test_only_the_published_file_is_taken(network, tmp_path, monkeypatch):
     assert torch.equal(same, network.features_of([image]))
 
 
-def test_another_network_is_refused_by_its_first_tensor(network, tmp_path):
-    state = dict(network.state_dict())
-    state["Mixed_5b.branch1x1.conv.weight"] = torch.zeros(1)
-    with pytest.raises(WeightsError, match=r"'Mixed_5b.branch1x1.conv.weight' has shape \(1,\)"):
-        inception_of(state, tmp_path / "other.pth")
+def test_another_network_is_refused_by_its_first_tensor(network, tmp_path, monkeypatch):
+    path, name = tmp_path / "other.pth", "Mixed_5b.branch1x1.conv.weight"
+    torch.save({**network.state_dict(), name: torch.zeros(1)}, path)
+    monkeypatch.setattr(module, "PUBLISHED", "")
+    with pytest.raises(WeightsError, match=rf"Inception of FID: tensor '{name}' has shape \(1,\)"):
+        load_inception(path)

@@ -17,15 +17,7 @@ from lidarpainter_models.metrics.images import (
 
 
 def flat_camera() -> Camera:
-    return Camera(
-        world_from_camera=torch.eye(4, dtype=torch.float64),
-        fx_px=10.0,
-        fy_px=10.0,
-        cx_px=16.0,
-        cy_px=16.0,
-        width_px=32,
-        height_px=32,
-    )
+    return Camera.centred(torch.eye(4, dtype=torch.float64), 10.0, width_px=32, height_px=32)
 
 
 def test_known_error_gives_known_psnr():
