@@ -79,5 +79,4 @@ def moved_meanwhile(
 
 
 def _moved(poses: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
-    moved: np.ndarray = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz_m) + poses[:, :3, 3]
-    return moved
+    return np.einsum("nij,nj->ni", poses[:, :3, :3], xyz_m) + poses[:, :3, 3]

@@ -152,6 +152,14 @@ def _lane_change(found: Mapping[str, str], spec: str) -> LaneChange:
     return LaneChange(width_m=width_m, start_s=start_s, duration_s=duration_s)
 
 
+def _waypoints(found: Mapping[str, str], _spec: str) -> PathWords:
+    return PathWords(file=found["name"])
+
+
+def _by_actor(*, looks: bool) -> _Read:
+    return lambda found, _spec: PathWords(actor=found["name"], looks=looks)
+
+
 def _birdseye(found: Mapping[str, str], spec: str) -> PathWords:
     height_m = _number(found["number"], spec) if "number" in found else BIRDSEYE_HEIGHT_M
     return PathWords(height_m=height_m, looks=True)
@@ -172,27 +180,9 @@ _WORDS = (
         r"(?::(?P<number>[^@]*))?(?:@(?P<times>.*))?",
         _lane_change,
     ),
-    TrajectoryWord(
-        "waypoints",
-        ":FILE.csv",
-        "places in a file",
-        _NAME,
-        lambda found, _spec: PathWords(file=found["name"]),
-    ),
-    TrajectoryWord(
-        "follow",
-        ":ACTOR",
-        "behind an actor",
-        _NAME,
-        lambda found, _spec: PathWords(actor=found["name"]),
-    ),
-    TrajectoryWord(
-        "orbit",
-        ":ACTOR",
-        "once around an actor",
-        _NAME,
-        lambda found, _spec: PathWords(actor=found["name"], looks=True),
-    ),
+    TrajectoryWord("waypoints", ":FILE.csv", "places in a file", _NAME, _waypoints),
+    TrajectoryWord("follow", ":ACTOR", "behind an actor", _NAME, _by_actor(looks=False)),
+    TrajectoryWord("orbit", ":ACTOR", "once around an actor", _NAME, _by_actor(looks=True)),
     TrajectoryWord(
         "birdseye", "[:METRES]", "down on the car from above", r"(?::(?P<number>.*))?", _birdseye
     ),

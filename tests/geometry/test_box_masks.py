@@ -13,15 +13,7 @@ from lidarpainter_models.geometry.transforms import (
 )
 
 SIZE_M = torch.tensor([4.0, 1.8, 1.5])
-CAMERA = Camera(
-    world_from_camera=torch.eye(4, dtype=torch.float64),
-    fx_px=60.0,
-    fy_px=60.0,
-    cx_px=48.0,
-    cy_px=32.0,
-    width_px=96,
-    height_px=64,
-)
+CAMERA = Camera.centred(torch.eye(4, dtype=torch.float64), 60.0, width_px=96, height_px=64)
 
 
 def box_at(x_m, y_m, z_m, yaw_rad=0.3):
