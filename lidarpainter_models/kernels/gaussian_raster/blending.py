@@ -201,13 +201,6 @@ def _blend_tile(
 
 
 @numba.njit(**EXACT)
-def _light_pixels(lanes: np.ndarray, rows: int, columns: int) -> None:
-    """Give every pixel of a tile that lies in the image its full light; the rest stay dark."""
-    for row in range(rows):
-        lanes[row * TILE_PX : row * TILE_PX + columns] = ONE
-
-
-@numba.njit(**EXACT)
 def _store_row(lanes: np.ndarray, row: int, place: int, flat: Images) -> None:
     """Write a whole tile row to pixels from a place on."""
     pixel = row * TILE_PX
@@ -258,7 +251,9 @@ def _draw_tile(
     height, width = images.depth.shape
     lanes = lane_array(FEATURES + features.shape[1] * PIXELS)
     lanes[:] = ZERO
-    _light_pixels(lanes, min(TILE_PX, height - corner[1]), min(TILE_PX, width - corner[0]))
+    columns = min(TILE_PX, width - corner[0])
+    for row in range(min(TILE_PX, height - corner[1])):  # pixels beside the image stay dark
+        lanes[row * TILE_PX : row * TILE_PX + columns] = ONE
     _blend_tile(records, features, lists, tile, corner, lanes)
     _store_tile(lanes, corner, images)
 

@@ -37,10 +37,9 @@ def draw_view(
     screen_gradient_out: Float[Tensor, " gaussians"] | None,
 ) -> DrawnImages:
     """Images as `SplatImage` lists them."""
-    drawn: DrawnImages = _DrawView.apply(
+    return _DrawView.apply(
         *splats.learned, features, camera_from_body, splats.body_index, camera, screen_gradient_out
     )
-    return drawn
 
 
 def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
@@ -97,17 +96,9 @@ class _DrawView(torch.autograd.Function):
 
 def _room_for_gradients(gaussians: Gaussians) -> Gradients:
     """Arrays for `unproject` to fill."""
-    count, bodies = len(gaussians.means), len(gaussians.camera_from_body)
-    return Gradients(
-        means=np.empty((count, 3), np.float32),
-        rotation_wxyz=np.empty((count, 4), np.float32),
-        scale_m=np.empty((count, 3), np.float32),
-        opacity=np.empty(count, np.float32),
-        sh=np.empty(gaussians.sh.shape, np.float32),
-        features=np.empty(gaussians.features.shape, np.float32),
-        camera_from_body=np.zeros((CHUNKS, bodies, 3, 4)),
-        absolute=np.empty(count, np.float32),
-    )
+    floats = [np.empty_like(array) for array in gaussians[:6]]
+    transforms = np.zeros((CHUNKS, len(gaussians.camera_from_body), 3, 4))
+    return Gradients._make([*floats, transforms, np.empty_like(gaussians.opacity)])
 
 
 def _tensor_gradients(found: Gradients, tensors: tuple[Tensor, ...]) -> list[Tensor]:

@@ -22,6 +22,7 @@ from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     load,
     shuffled,
     spread_to,
+    spreading,
     store,
 )
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
@@ -60,14 +61,8 @@ def lane_numbers(typingctx):
     return DOUBLES(), generate
 
 
-@intrinsic
-def in_all(typingctx, value):
-    """A number in all lanes."""
-
-    def generate(context, builder, signature, arguments):
-        return spread_to(DOUBLES, context, builder, arguments[0], value)
-
-    return DOUBLES(value), generate
+in_all = spreading(DOUBLES)
+"""A number in all lanes."""
 
 
 def _pointers(context, builder, kinds, where):
@@ -150,30 +145,23 @@ def _of_body(transforms: np.ndarray, rows: Rows, of_one_body: bool, number: int)
 
 
 @numba.njit(**EXACT)
+def _three(transforms: np.ndarray, rows: Rows, of_one_body: bool, first: int, step: int) -> Vector:
+    return (
+        _of_body(transforms, rows, of_one_body, first),
+        _of_body(transforms, rows, of_one_body, first + step),
+        _of_body(transforms, rows, of_one_body, first + 2 * step),
+    )
+
+
+@numba.njit(**EXACT)
 def transforms_of(transforms: np.ndarray, rows: Rows, of_one_body: bool) -> tuple[Matrix, Vector]:
     """Rotation rows and translations of the bodies of eight Gaussians; `transforms` is float64."""
     rotation = (
-        (
-            _of_body(transforms, rows, of_one_body, 0),
-            _of_body(transforms, rows, of_one_body, 1),
-            _of_body(transforms, rows, of_one_body, 2),
-        ),
-        (
-            _of_body(transforms, rows, of_one_body, 4),
-            _of_body(transforms, rows, of_one_body, 5),
-            _of_body(transforms, rows, of_one_body, 6),
-        ),
-        (
-            _of_body(transforms, rows, of_one_body, 8),
-            _of_body(transforms, rows, of_one_body, 9),
-            _of_body(transforms, rows, of_one_body, 10),
-        ),
+        _three(transforms, rows, of_one_body, 0, 1),
+        _three(transforms, rows, of_one_body, 4, 1),
+        _three(transforms, rows, of_one_body, 8, 1),
     )
-    return rotation, (
-        _of_body(transforms, rows, of_one_body, 3),
-        _of_body(transforms, rows, of_one_body, 7),
-        _of_body(transforms, rows, of_one_body, 11),
-    )
+    return rotation, _three(transforms, rows, of_one_body, 3, 4)
 
 
 @numba.njit(**EXACT)

@@ -86,6 +86,19 @@ def spread_to(lanes: LaneType, context, builder, value, kind):
     return builder.shuffle_vector(start, nothing, places)
 
 
+def spreading(lanes: LaneType):
+    """An intrinsic that puts a number in all lanes."""
+
+    @intrinsic
+    def in_lanes(typingctx, value):
+        def generate(context, builder, signature, arguments):
+            return spread_to(lanes, context, builder, arguments[0], value)
+
+        return lanes(value), generate
+
+    return in_lanes
+
+
 def shuffled(builder, first, second, places):
     """The lanes of two values at these places, the second's after the first's."""
     kind = ir.VectorType(ir.IntType(32), len(places))

@@ -21,7 +21,7 @@ from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     index,
     intrinsic,
     shuffled,
-    spread_to,
+    spreading,
 )
 
 LANES = FLOATS.count
@@ -46,14 +46,8 @@ def lane_centres(typingctx):
     return FLOATS(), generate
 
 
-@intrinsic
-def spread(typingctx, value):
-    """A number in all lanes."""
-
-    def generate(context, builder, signature, arguments):
-        return spread_to(FLOATS, context, builder, arguments[0], signature.args[0])
-
-    return FLOATS(value), generate
+spread = spreading(FLOATS)
+"""A number in all lanes."""
 
 
 def _quarter(builder, value):

@@ -161,14 +161,7 @@ def _seen(screen: ScreenGaussians, view: Camera) -> ScreenGaussians:
 
 
 def _chosen(screen: ScreenGaussians, kept: Tensor) -> ScreenGaussians:
-    return ScreenGaussians(
-        index=screen.index[kept],
-        centre_px=screen.centre_px[kept],
-        covariance_px2=screen.covariance_px2[kept],
-        opacity=screen.opacity[kept],
-        values=screen.values[kept],
-        half_size_px=screen.half_size_px[kept],
-    )
+    return ScreenGaussians(**{name: column[kept] for name, column in vars(screen).items()})
 
 
 class ScreenGradientWatch:

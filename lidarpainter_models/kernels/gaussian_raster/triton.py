@@ -45,14 +45,13 @@ def draw_view(
 ) -> DrawnImages:
     """Images as `SplatImage` lists them."""
     with torch.cuda.device_of(splats.means):
-        drawn: DrawnImages = _DrawView.apply(
+        return _DrawView.apply(
             *(tensor.float().contiguous() for tensor in (*splats.learned, features)),
             camera_from_body.double().contiguous(),
             splats.body_index.int().contiguous(),
             camera,
             screen_gradient_out,
         )
-    return drawn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
