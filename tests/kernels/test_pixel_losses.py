@@ -50,7 +50,7 @@ def image_of(rgb, depth_m, alpha):
         rgb=rgb,
         depth_m=depth_m,
         alpha=alpha,
-        features=torch.zeros(HEIGHT_PX, WIDTH_PX, 0),
+        features=rgb[..., :0],
         visible=torch.zeros(0, dtype=torch.bool),
     )
 
@@ -185,13 +185,7 @@ def test_image_without_returns_has_no_depth_term(backend):
 def test_opaque_pixels_send_no_gradient_to_the_sky():
     alpha = torch.tensor([[0.0, 0.5, 0.79, 0.81, 1.0]])
     sky_rgb = torch.rand(1, 5, 3, requires_grad=True)
-    splat = SplatImage(
-        rgb=torch.zeros(1, 5, 3),
-        depth_m=torch.zeros(1, 5),
-        alpha=alpha,
-        features=torch.zeros(1, 5, 0),
-        visible=torch.zeros(0, dtype=torch.bool),
-    )
+    splat = image_of(torch.zeros(1, 5, 3), torch.zeros(1, 5), alpha)
     composed(splat, sky_rgb, 0.2).sum().backward()
     expected = torch.tensor([[1.0, 0.5, 0.21, 0.0, 0.0]])
     assert torch.allclose(sky_rgb.grad, expected[..., None].expand(1, 5, 3), atol=1e-6)

@@ -14,7 +14,7 @@ from lidarpainter_models.kernels.sparse_adam import (
     present_rows,
     step_rows,
 )
-from lidarpainter_models.kernels.sparse_adam.missed_steps import gathered_steps
+from lidarpainter_models.kernels.sparse_adam.reference import gathered_steps
 
 EPS = torch.finfo(torch.float32).eps
 WIDTHS = [3, 4, 3, 1, 3, 9]
