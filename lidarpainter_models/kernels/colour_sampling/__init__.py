@@ -66,10 +66,7 @@ def project_inside(
             f"{tuple(pixels_from_points.shape)}"
         )
     project = implementation("colour_sampling", "project_inside", backend, xyz_m.device)
-    found: tuple[Tensor, Tensor, Tensor] = project(
-        xyz_m, pixels_from_points, width_px, height_px, near_m
-    )
-    return found
+    return project(xyz_m, pixels_from_points, width_px, height_px, near_m)
 
 
 def read_inside(
@@ -95,8 +92,7 @@ def read_inside(
             f"{tuple(camera.shape)}"
         )
     read = implementation("colour_sampling", "read_inside", backend, xyz_m.device)
-    found: tuple[Tensor, Tensor, Tensor] = read(xyz_m, camera, margin_px, near_m, rounds)
-    return found
+    return read(xyz_m, camera, margin_px, near_m, rounds)
 
 
 def in_any_image(
@@ -120,8 +116,7 @@ def in_any_image(
             f"{tuple(cameras.shape)}"
         )
     ask = implementation("colour_sampling", "in_any_image", backend, xyz_m.device)
-    inside: Tensor = ask(xyz_m, cameras, near_m, rounds)
-    return inside
+    return ask(xyz_m, cameras, near_m, rounds)
 
 
 def insert_samples(

@@ -62,9 +62,7 @@ def depths_before(
     points: Float[ndarray, "points 3"], camera: AssumedCamera, *, backend: Backend = "auto"
 ) -> Float[ndarray, " points"]:
     """How far before a camera points of the world lie."""
-    measure = implementation("point_contrasts", "depths_before", backend, _CPU)
-    depth_m: ndarray = measure(points, camera)
-    return depth_m
+    return implementation("point_contrasts", "depths_before", backend, _CPU)(points, camera)
 
 
 def seen_contrasts(
@@ -91,5 +89,4 @@ def seen_contrasts(
     if levels.shape[1:3] != nearest_m.shape:
         raise ShapeError(f"contrasts of {levels.shape[1:3]} px with returns of {nearest_m.shape}")
     look = implementation("point_contrasts", "seen_contrasts", backend, _CPU)
-    seen: SeenContrasts = look(points, camera, levels, nearest_m, level, hub_depth_m)
-    return seen
+    return look(points, camera, levels, nearest_m, level, hub_depth_m)

@@ -115,14 +115,10 @@ def trace_rays(
         "ray_gaussians", "trace_rays", backend, rays.origin_m.device, dtype=rays.origin_m.dtype
     )
     with torch.no_grad():
-        found: RayReturns = trace(rays, gaussians, most_hits)
-    return found
+        return trace(rays, gaussians, most_hits)
 
 
-def blended_hits(
-    hits: RayHits,
-    opacity: Float[Tensor, " gaussians"],
-) -> Float[Tensor, "rays hits"]:
+def blended_hits(hits: RayHits, opacity: Float[Tensor, " gaussians"]) -> Float[Tensor, "rays hits"]:
     """How much of each ray every listed answer stops; differentiable in the opacities."""
     is_there = hits.row >= 0
     alpha = opacity[hits.row.clamp(min=0)] * hits.response * is_there

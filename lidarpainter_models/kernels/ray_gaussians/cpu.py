@@ -79,7 +79,7 @@ def _trace(rays: Rays, gaussians: Ellipsoids, out: tuple[np.ndarray, ...]) -> No
     is_reached = (bounds[:, 3] >= edges[0]) & (bounds[:, 2] <= edges[-1])
     order = np.flatnonzero(is_reached)
     order = order[np.argsort(near_m[order], kind="stable")]
-    starts, lists = tile_lists(order, bounds, 0.0, columns, edges)
+    starts, lists = tile_lists(order, bounds, columns, edges)
     tile = _tile_of(azimuth, elevation, columns, edges)
     thin, whitening = scale_m.argmin(axis=1), axes / scale_m[:, :, None]
     _follow(
@@ -114,8 +114,7 @@ def _tile_of(
     rows = len(edges) - 1
     column = np.floor(azimuth / (TURN_RAD / columns)).astype(np.int64) % columns
     row = np.clip(np.searchsorted(edges, elevation, side="right") - 1, 0, rows - 1)
-    tile: np.ndarray = column * rows + row
-    return tile
+    return column * rows + row
 
 
 _INNER: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "forceinline": True}

@@ -8,18 +8,16 @@ Gaussian make between the rays.
 """
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 
-INSIDE: dict[str, Any] = {"nogil": True}
 TURN_RAD, RIGHT_RAD = 2 * math.pi, math.pi / 2
 SLACK_RAD = 2e-5
 """What float32 leaves of angles."""
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def touching_angles(xx: float, xy: float, yy: float) -> tuple[float, float]:
     """Angles of the lines through the origin that touch an ellipse: their middle and half-width.
 
@@ -40,13 +38,13 @@ def touching_angles(xx: float, xy: float, yy: float) -> tuple[float, float]:
     return 0.5 * (math.atan2(sine, cosine) + math.pi), 0.5 * math.acos(mean / reach)
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def _wrapped(angle_rad: float) -> float:
     """The same angle from -pi to pi."""
     return angle_rad - TURN_RAD * math.floor(angle_rad / TURN_RAD + 0.5)
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def bounds_of(
     mean: np.ndarray, covariance: np.ndarray, reach: float, grown_m: float
 ) -> tuple[float, float, float, float]:
@@ -93,7 +91,7 @@ def bounds_of(
     return middle, half, low, high
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def beside_rays(solids: tuple, sector: tuple, faintest: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the Gaussians that a sphere around each lets some rays meet, and their own growth.
 
@@ -128,7 +126,7 @@ def beside_rays(solids: tuple, sector: tuple, faintest: float) -> tuple[np.ndarr
     return rows[:count], grown_m[:count]
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def bounded(
     means: np.ndarray,
     axes: np.ndarray,
@@ -162,17 +160,16 @@ def bounded(
     return bounds, near_m
 
 
-@numba.njit(cache=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def tile_lists(
-    order: np.ndarray, bounds: np.ndarray, first_rad: float, columns: int, edges_rad: np.ndarray
+    order: np.ndarray, bounds: np.ndarray, columns: int, edges_rad: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the list of each tile starts (tiles + 1), and the Gaussians in the order given.
 
     Args:
         order: Gaussians, nearest first.
         bounds: their angular bounds.
-        first_rad: azimuth at which the first of the columns begins; they fill the turn.
-        columns: how many there are.
+        columns: how many there are; they fill the turn from azimuth 0 on.
         edges_rad: elevations (rows + 1) between rows of tiles, ascending.
     """
     rows, width = len(edges_rad) - 1, TURN_RAD / columns
@@ -182,8 +179,8 @@ def tile_lists(
         for g in order:
             low_row = max(np.searchsorted(edges_rad, bounds[g, 2], side="right") - 1, 0)
             high_row = min(np.searchsorted(edges_rad, bounds[g, 3], side="left"), rows)
-            left = math.floor((bounds[g, 0] - bounds[g, 1] - first_rad) / width)
-            right = math.floor((bounds[g, 0] + bounds[g, 1] - first_rad) / width)
+            left = math.floor((bounds[g, 0] - bounds[g, 1]) / width)
+            right = math.floor((bounds[g, 0] + bounds[g, 1]) / width)
             for column in range(left, min(right, left + columns - 1) + 1):
                 for row in range(low_row, high_row):
                     tile = column % columns * rows + row

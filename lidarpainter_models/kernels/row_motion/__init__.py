@@ -54,5 +54,4 @@ def motion_until_read(
     )
     poses, rates = (matrices.detach().to(means) for matrices in (camera_from_body, metres_per_s))
     shapes = (each.detach() for each in (means, rotation_wxyz))
-    found: tuple[Tensor, Tensor] = move(*shapes, body_index, poses, rates, camera)
-    return found
+    return move(*shapes, body_index, poses, rates, camera)

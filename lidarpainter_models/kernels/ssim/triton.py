@@ -19,8 +19,7 @@ rows more than it writes."""
 
 def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:
     """SSIM around every pixel; differentiable in the first image."""
-    found: Tensor = _SsimMap.apply(*_as_read(first_rgb, second_rgb))
-    return found
+    return _SsimMap.apply(*_as_read(first_rgb, second_rgb))
 
 
 def l1_ssim_loss(
@@ -30,8 +29,7 @@ def l1_ssim_loss(
     images, weight = _as_read(rendered, target), None
     if pixel_weight is not None:
         (weight,) = _as_read(pixel_weight)
-    found: Tensor = _L1SsimLoss.apply(*images, weight, ssim_weight)
-    return found
+    return _L1SsimLoss.apply(*images, weight, ssim_weight)
 
 
 class _SsimMap(torch.autograd.Function):
