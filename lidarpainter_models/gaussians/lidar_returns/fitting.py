@@ -6,7 +6,7 @@ turn clear, each moves a little along its normal, and two small heads learn what
 do to intensity and loss (after NeuRAD, Tonderski et al., 2024). The fitted scene stays as it is.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,6 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.initialisation.adaptive_voxels import Cloud, adaptive_voxels
+from lidarpainter_models.gaussians.initialisation.surfels import surfels_from_points
 from lidarpainter_models.gaussians.lidar_returns.channel import (
     NOISE_EDGES_M,
     Heads,
@@ -23,12 +25,13 @@ from lidarpainter_models.gaussians.lidar_returns.channel import (
     thin_axes,
 )
 from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
-from lidarpainter_models.gaussians.lidar_returns.surfels import surfels_of
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.placing import joined_gaussians
 from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
 from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_rays
+from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 SOFT_M, LOST_M = 0.05, 5.0
@@ -146,6 +149,53 @@ def _sweeps(
         rays = recorded_rays(scene, sweep, lidar)
         found.append(rays.select(torch.randperm(len(rays), generator=random)[:most]))
     return found
+
+
+SPACING = 0.004
+"""Spacing that is asked for, in units of the range: about that of the beams of a dense sensor."""
+LEAST_VOXEL_M = 0.05
+REACH = 0.5
+"""Largest standard deviation within the surface, in voxels."""
+THICKNESS = 0.05
+"""Standard deviation across the surface, in units of that within it, at least."""
+
+
+def surfels_of(
+    scene: DrivingScene, frames: Collection[int], *, most: int
+) -> tuple[GaussianSet, tuple[str, ...]]:
+    """Flat Gaussians on what the sweeps of some frames met: the street, each actor in its box.
+
+    A fit to images leaves surfaces a few centimetres thick and lets the far ones float; a LiDAR
+    says within two centimetres where they are. So rays meet surfels of the LiDAR map, which stand
+    for no image, and the fitted scene's own Gaussians only where nobody swept: of inserted actors.
+
+    Args:
+        scene: the log, its poses corrected.
+        frames: whose sweeps are read; no other is.
+        most: how many surfels there may be.
+
+    Returns:
+        The surfels, and the ids of the actors that bodies 1, 2, ... are.
+    """
+    points = gather_points(scene, frames)
+    clouds = [
+        Cloud.of(
+            part, SPACING * part.range_m, torch.ones(len(part), dtype=torch.bool), LEAST_VOXEL_M
+        )
+        for part in (points.street, *points.actors.values())
+    ]
+    sets = [
+        surfels_from_points(
+            voxels.xyz_m,
+            torch.full_like(voxels.xyz_m, 0.5),
+            body=body,
+            sh_degree=0,
+            most_sigma_m=REACH * voxels.size_m,
+            least_thickness=THICKNESS,
+        )
+        for body, voxels in enumerate(adaptive_voxels(clouds, budget=most))
+    ]
+    return joined_gaussians(sets), tuple(points.actors)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
