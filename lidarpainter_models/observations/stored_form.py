@@ -11,8 +11,8 @@ from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import faults_from_records
 from lidarpainter_models.scenes.ego_corrections import EgoCorrections
-from lidarpainter_models.scenes.stored_tracks import COLUMNS as TRACK_COLUMNS
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
+from lidarpainter_models.storage.tensor_files import grouped
 
 SCHEMA = 1
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
@@ -73,20 +73,14 @@ def observations_from_arrays(
             f"stored observations have schema {metadata.get('schema')}, this version reads "
             f"{SCHEMA}: prepare them again"
         )
-    tracks = tracks_from_arrays(
-        {name: arrays[f"tracks.{name}"] for name in TRACK_COLUMNS}, metadata["tracks"]
-    )
+    groups = grouped(arrays)
     street, *actors = (
         MapPoints(
             **{column.name: arrays[f"map.{index}.{column.name}"] for column in fields(MapPoints)}
         )
         for index in range(len(metadata["map_actors"]) + 1)
     )
-    bodies = {
-        name.removeprefix("own_body."): body
-        for name, body in arrays.items()
-        if name.startswith("own_body.")
-    }
+    bodies = groups.get("own_body", {})
     views = [
         _stored_view(arrays, index, row, bodies) for index, row in enumerate(metadata["views"])
     ]
@@ -95,14 +89,8 @@ def observations_from_arrays(
         lidar_map=LidarMap(
             street=street, actors=dict(zip(metadata["map_actors"], actors, strict=True))
         ),
-        tracks=tracks,
-        path=EgoCorrections.from_tensors(
-            {
-                name.removeprefix("path."): value
-                for name, value in arrays.items()
-                if name.startswith("path.")
-            }
-        ),
+        tracks=tracks_from_arrays(groups["tracks"], metadata["tracks"]),
+        path=EgoCorrections.from_tensors(groups.get("path", {})),
         faults=faults_from_records(metadata.get("faults", {})),
         own_bodies=bodies,
         is_estimated=metadata.get("is_estimated", False),

@@ -71,6 +71,15 @@ def open_tensors(
         raise damaged(f"{path} is not a readable safetensors file: {error}") from None
 
 
+def grouped(tensors: Mapping[str, Tensor], separator: str = ".") -> dict[str, dict[str, Tensor]]:
+    """Tensors by what their names begin with, under the rest of these."""
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        group, _, own_name = name.partition(separator)
+        groups.setdefault(group, {})[own_name] = value
+    return groups
+
+
 def _stored(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 

@@ -15,9 +15,8 @@ from torch import Generator, Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet, axes_at
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -156,9 +155,7 @@ def random_balls(
 
 def is_flat(gaussians: GaussianSet) -> Bool[Tensor, " gaussians"]:
     """Street Gaussians that lie like a plate on the ground: their thinnest axis points up."""
-    rotation = rotation_from_quaternion(gaussians.rotation_wxyz)
-    thinnest = gaussians.log_scale.argmin(dim=1)
-    up = rotation[torch.arange(len(thinnest)), 2, thinnest].abs()
+    up = axes_at(gaussians.rotation_wxyz, gaussians.log_scale.argmin(dim=1))[:, 2].abs()
     return (up > 0.9) & (gaussians.body_index == 0)
 
 

@@ -68,13 +68,3 @@ def group_tensors(groups: dict[str, dict[str, Tensor]]) -> dict[str, Tensor]:
         for group, tensors in groups.items()
         for name, value in tensors.items()
     }
-
-
-def ungroup_tensors(tensors: dict[str, Tensor], group: str) -> dict[str, Tensor]:
-    """Return the tensors of one group by their own names."""
-    prefix = f"{group}/"
-    return {
-        name.removeprefix(prefix): value
-        for name, value in tensors.items()
-        if name.startswith(prefix)
-    }

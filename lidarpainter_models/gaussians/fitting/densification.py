@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, axes_at
 
 BOX_MARGIN, BOX_MARGIN_M = 1.1, 0.1
 """An actor's Gaussian may lie this far out, in half sizes of its box, and this much further:
@@ -115,15 +114,12 @@ def split_along_longest_axis(parents: GaussianSet) -> GaussianSet:
     columns = parents.columns()
     longest = columns["log_scale"].argmax(dim=1)
     rows = torch.arange(len(parents), device=longest.device)
-    axes = rotation_from_quaternion(columns["rotation_wxyz"])
-    direction = axes[rows, :, longest]
+    direction = axes_at(columns["rotation_wxyz"], longest)
     offset_m = 0.75 * columns["log_scale"][rows, longest].exp()[:, None] * direction
     log_scale = columns["log_scale"].clone()
     log_scale[rows, longest] += torch.log(torch.tensor(0.66))
-    halves = []
-    for sign in (1.0, -1.0):
-        half = {name: value.clone() for name, value in columns.items()}
-        half["means"] = columns["means"] + sign * offset_m
-        half["log_scale"] = log_scale.clone()
-        halves.append(GaussianSet(**half))
-    return halves[0].append(halves[1])
+    first, second = (
+        GaussianSet(**columns | {"means": columns["means"] + way_m, "log_scale": log_scale})
+        for way_m in (offset_m, -offset_m)
+    )
+    return first.append(second)

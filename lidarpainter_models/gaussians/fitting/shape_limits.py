@@ -8,13 +8,13 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.geometry.transforms import invert_rigid, rotation_from_quaternion
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, axes_at
+from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.scenes.splits import sampled_rows
 
 _ALONG = math.cos(math.radians(45))
@@ -76,7 +76,7 @@ def limit_shapes(gaussians: GaussianSet, rays: ViewingRays) -> None:
     """Shorten needles, thicken films and shrink giants, in place (`log_scale`)."""
     with torch.no_grad():
         ordered, order = gaussians.log_scale.sort(dim=1)
-        direction = _axis(gaussians.rotation_wxyz, order[:, 2])
+        direction = axes_at(gaussians.rotation_wxyz, order[:, 2])
         length = rays.mean_direction.norm(dim=1)
         along = (direction * rays.mean_direction).sum(dim=1).abs() / length.clamp(min=1e-3)
         is_needle = (along > _ALONG) & (length > STEADY_RAY)
@@ -85,11 +85,3 @@ def limit_shapes(gaussians: GaussianSet, rays: ViewingRays) -> None:
         limit = torch.minimum(limit, (rays.distance_m * MOST_SIGMA).log())
         capped = torch.minimum(gaussians.log_scale, limit[:, None])
         gaussians.log_scale.copy_(capped.clamp(min=math.log(LEAST_SIGMA_M)))
-
-
-def _axis(
-    rotation_wxyz: Float[Tensor, "gaussians 4"], axis: Int[Tensor, " gaussians"]
-) -> Float[Tensor, "gaussians 3"]:
-    """The given column of each rotation matrix."""
-    rotation = rotation_from_quaternion(rotation_wxyz)
-    return rotation.gather(2, axis[:, None, None].expand(-1, 3, 1))[..., 0]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors, ungroup_tensors
+from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors
 from lidarpainter_models.gaussians.fitting.config import FitConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fitting.loss import Perceptual
@@ -38,6 +38,7 @@ from lidarpainter_models.kernels.sparse_adam import (
     present_rows,
     step_rows,
 )
+from lidarpainter_models.storage.tensor_files import grouped
 
 COLOUR_PIXELS = 0.5
 """A colour takes about half a step where its Gaussian fills this much of a pixel of a view. Adam's
@@ -308,22 +309,22 @@ class FitState:
         perceptual: Perceptual | None = None,
     ) -> "FitState":
         """The state that `keep` described; where it was kept from does not matter."""
-        scene = scene_from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
+        groups = grouped(tensors, "/")
+        scene = scene_from_arrays(groups["scene"], numbers["scene"])
         scene = scene if device is None else scene.to(device)
         state = cls.begin(scene, config, pixels_per_view, perceptual)
-        state.gaussian_adam.load(ungroup_tensors(tensors, "gaussian_adam"))
+        state.gaussian_adam.load(groups["gaussian_adam"])
         for name, adam in state.refinement.adams.items():
-            adam.load(ungroup_tensors(tensors, name))
+            adam.load(groups[name])
         state.blocks = SpatialBlocks.with_rows_in(
-            tensors["blocks/block_of_row"].to(device),
+            groups["blocks"]["block_of_row"].to(device),
             state.scene.gaussians,
             state.blocks.reach_sigmas,
         )
-        kept_hidden = ungroup_tensors(tensors, "hidden")
-        state.hidden = HiddenGaussians.from_tensors(kept_hidden, state.scene.device)
-        tally = ungroup_tensors(tensors, "tally")
-        state.tally = GradientTally(**{name: value.to(device) for name, value in tally.items()})
-        state.generator.set_state(tensors["random/state"])
+        state.hidden = HiddenGaussians.from_tensors(groups["hidden"], state.scene.device)
+        tally = {name: value.to(device) for name, value in groups["tally"].items()}
+        state.tally = GradientTally(**tally)
+        state.generator.set_state(groups["random"]["state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
         state.sought_lamps = numbers.get("sought_lamps", False)

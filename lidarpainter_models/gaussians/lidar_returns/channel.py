@@ -18,9 +18,9 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import joined_gaussians
 from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
-from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
 from lidarpainter_models.lidar.firings import SweepRays
+from lidarpainter_models.storage.tensor_files import grouped
 
 SCHEMA = 1
 FAR_M = 50.0
@@ -154,11 +154,10 @@ class LidarChannel:
     full_intensity: float
     """What the sensor reports of the brightest surface."""
 
-    def solids(self, scene: GaussianScene) -> tuple[Solids, Int[Tensor, " solids"]]:
+    def solids(self, scene: GaussianScene) -> Solids:
         """What rays meet in a scene that this log's fit, or a change of it, has given.
 
-        Returns:
-            Solids with strength and drop as channels, their bodies those of the scene.
+        Strength and drop are its channels, bodies those of the scene.
         """
         surfels, kept = in_bodies_of(scene, self.surfels, self.actor_ids)
         channels = torch.stack([self.strength, self.drop], dim=1)[kept]
@@ -172,7 +171,7 @@ class LidarChannel:
             surfels = joined_gaussians([surfels, others])
             usual = channels.median(dim=0).values.expand(len(others), 2)
             channels = torch.cat([channels, usual])
-        return Solids(gaussians=surfels, channels=channels), surfels.body_index.long()
+        return Solids(gaussians=surfels, channels=channels)
 
     @torch.no_grad()
     def simulated(
@@ -185,7 +184,8 @@ class LidarChannel:
             rays: of any sensor, from anywhere.
             seed: draws what is lost, and noise; None takes what is likelier, without noise.
         """
-        solids, bodies = self.solids(scene)
+        solids = self.solids(scene)
+        bodies = solids.gaussians.body_index.long()
         found = trace_sweep(scene, solids, rays, most_hits=LISTED)
         share = 1 / found.alpha.clamp(min=1e-4)
         met = MetSurfaces(
@@ -252,11 +252,7 @@ def channel_from_arrays(arrays: Mapping[str, Tensor], metadata: Mapping[str, Any
         raise SceneError(
             f"a stored LiDAR channel has schema {metadata.get('schema')}, not {SCHEMA}"
         )
-    groups: dict[str, dict[str, Tensor]] = {}
-    for name, value in arrays.items():
-        group, _, column = name.partition(".")
-        groups.setdefault(group, {})[column] = value
-    heads = Heads()
+    groups, heads = grouped(arrays), Heads()
     try:
         heads.load_state_dict(groups["heads"])
         return LidarChannel(
@@ -316,10 +312,3 @@ def without_colours(gaussians: GaussianSet) -> GaussianSet:
     """The same Gaussians in one colour, to stand beside surfels."""
     count = len(gaussians)
     return replace(gaussians, sh_dc=torch.zeros(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))
-
-
-def thin_axes(surfels: GaussianSet) -> Float[Tensor, "surfels 3"]:
-    """Unit vectors along the thinnest axis of each, in its body's frame."""
-    axes = rotation_from_quaternion(surfels.rotation_wxyz)
-    thin = surfels.log_scale.argmin(dim=1)
-    return axes.gather(2, thin[:, None, None].expand(-1, 3, 1))[..., 0]

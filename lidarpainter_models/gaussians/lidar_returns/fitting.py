@@ -22,11 +22,10 @@ from lidarpainter_models.gaussians.lidar_returns.channel import (
     LidarChannel,
     MetSurfaces,
     in_bodies_of,
-    thin_axes,
 )
 from lidarpainter_models.gaussians.lidar_returns.settings import LidarConfig
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, axes_at
 from lidarpainter_models.gaussians.model.placing import joined_gaussians
 from lidarpainter_models.gaussians.model.sweep_rendering import Solids, trace_sweep
 from lidarpainter_models.kernels.ray_gaussians import RayHits, blended_hits
@@ -250,7 +249,8 @@ class _Learnt:
 
     def surfels_now(self) -> GaussianSet:
         """The surfels where they are by now, as clear as they are."""
-        moved = self.offset_m.detach()[:, None] * thin_axes(self.surfels)
+        thin_axes = axes_at(self.surfels.rotation_wxyz, self.surfels.log_scale.argmin(dim=1))
+        moved = self.offset_m.detach()[:, None] * thin_axes
         return replace(
             self.surfels,
             means=self.surfels.means + moved,

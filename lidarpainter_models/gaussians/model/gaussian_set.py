@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 
 SH_CONSTANT = 0.28209479177387814  # value of the harmonic of degree 0
 PARAMETERS = ("means", "rotation_wxyz", "log_scale", "opacity_logit", "sh_dc", "sh_rest")
@@ -21,6 +22,14 @@ PARAMETERS = ("means", "rotation_wxyz", "log_scale", "opacity_logit", "sh_dc", "
 def sh_from_rgb(rgb: Float[Tensor, "gaussians 3"]) -> Float[Tensor, "gaussians 1 3"]:
     """Constant harmonics that show the colours as they are."""
     return ((rgb - 0.5) / SH_CONSTANT)[:, None]
+
+
+def axes_at(
+    rotation_wxyz: Float[Tensor, "gaussians 4"], which: Int[Tensor, " gaussians"]
+) -> Float[Tensor, "gaussians 3"]:
+    """Unit vectors along one axis of each Gaussian, in the frame of its body."""
+    rotation = rotation_from_quaternion(rotation_wxyz)
+    return rotation.gather(2, which[:, None, None].expand(-1, 3, 1))[..., 0]
 
 
 class Shapes:

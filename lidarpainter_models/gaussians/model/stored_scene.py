@@ -18,6 +18,7 @@ from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
 from lidarpainter_models.scenes.camera_faults import faults_from_records
 from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
+from lidarpainter_models.storage.tensor_files import grouped
 
 SCHEMA = 1
 
@@ -79,10 +80,7 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
             f"a stored Gaussian scene has schema {metadata.get('schema')}, this version reads "
             f"{SCHEMA}: fit it again"
         )
-    groups: dict[str, dict[str, Tensor]] = {}
-    for name, value in arrays.items():
-        group, _, column = name.partition(".")
-        groups.setdefault(group, {})[column] = value
+    groups = grouped(arrays)
     try:
         return GaussianScene(
             gaussians=GaussianSet(**groups["gaussians"]),

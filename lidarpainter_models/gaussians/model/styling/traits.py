@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, axes_at
 from lidarpainter_models.gaussians.model.styling.scene_style import StyledPlace
-from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
 from lidarpainter_models.kernels.scene_light import Surfaces, body_radii
 from lidarpainter_models.weather.darkness import FACING, HEADLAMP_HEIGHT_M, LEAST_GRAZING
@@ -235,9 +234,7 @@ def _normals(
 ) -> Float[Tensor, "gaussians 3"]:
     """The shortest axis of each Gaussian in its body, shorter the less flat it is."""
     shortest, middle, _ = scale_m.sort(dim=1).values.unbind(1)
-    axis = scale_m.argmin(dim=1)
-    rotation = rotation_from_quaternion(columns["rotation_wxyz"])
-    normals = rotation[torch.arange(len(axis), device=axis.device), :, axis]
+    normals = axes_at(columns["rotation_wxyz"], scale_m.argmin(dim=1))
     return normals * (1 - shortest / middle.clamp_min(1e-9))[:, None]
 
 
