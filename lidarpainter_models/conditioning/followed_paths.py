@@ -14,7 +14,7 @@ from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import LENS, Camera
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.collisions import Collision
 from lidarpainter_models.observations.image_shrinking import fit_camera
@@ -92,9 +92,13 @@ class FollowedPath:
 
     @cached_property
     def _cameras(self) -> tuple[Camera, ...]:
-        cameras = [fit_camera(view, self.observation) for view in self.views]
-        found = map(self._found, self.views, cameras)
-        return self._moving.moved(self.views, list(found))
+        found = [
+            found_camera(
+                self.builder.scene, self.recorded, view, fit_camera(view, self.observation)
+            )
+            for view in self.views
+        ]
+        return self._moving.moved(self.views, found)
 
     def shown(self, camera: Camera, view: RecordedView) -> ShownMoment:
         """What is seen there, and what is known beside it."""
@@ -108,9 +112,6 @@ class FollowedPath:
         scene = self.builder.scene
         seen = scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         return ShownMoment(rgb=seen.rgb.clamp(0, 1), unpainted_rgb=None, depth_m=seen.depth_m)
-
-    def _found(self, view: RecordedView, camera: Camera) -> Camera:
-        return found_camera(self.builder.scene, self.recorded, view, camera)
 
 
 def found_camera(
@@ -174,10 +175,5 @@ def image_record(file: str, camera: Camera, view: RecordedView) -> dict[str, Any
         "frame_index": view.frame_index,
         "timestamp_ns": view.timestamp_ns,
         "world_from_camera": camera.world_from_camera.reshape(-1).tolist(),
-        "fx_px": camera.fx_px,
-        "fy_px": camera.fy_px,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
+        **{name: getattr(camera, name) for name in LENS},
     }

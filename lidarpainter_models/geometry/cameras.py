@@ -15,6 +15,8 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, transform_points
 
+LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+"""What a camera is besides its pose and its shutter."""
 READ_ROUNDS = 2  # a second guess of where a point is read moves it by less than 0.01 px
 
 

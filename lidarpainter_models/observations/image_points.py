@@ -21,7 +21,7 @@ from lidarpainter_models.lidar.colouring import BEAM_SPACING_RAD
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
-from lidarpainter_models.observations.own_body import on_grid
+from lidarpainter_models.observations.own_body import baseline_m, on_grid
 from lidarpainter_models.observations.plane_sweep import sweep_cost, sweep_depths
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -98,7 +98,7 @@ def _of_camera(
     """The points that each image of a camera gives."""
     apart: list[RecordedView] = []
     for view in views[:: max(1, -(-len(views) // MOST_VIEWS_PER_CAMERA))]:
-        if not apart or _baseline_m(apart[-1], view) >= LEAST_BASELINE_M:
+        if not apart or baseline_m(apart[-1], view) >= LEAST_BASELINE_M:
             apart.append(view)
     if len(apart) < 2:
         return []
@@ -112,10 +112,6 @@ def _of_camera(
         _points(image, torch.where(is_sure, depth_m, 0.0))
         for image, depth_m, is_sure in zip(images, depths, confirmed, strict=True)
     ]
-
-
-def _baseline_m(first: RecordedView, second: RecordedView) -> float:
-    return float((first.camera.centre_world - second.camera.centre_world).norm())
 
 
 def _made_ready(

@@ -76,16 +76,14 @@ def own_bodies(
     Nothing for cameras that `cannot_be_told` names.
     """
     moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    names = sorted({view.camera_name for view in views})
-    chosen = [_far_apart([view for view in views if view.camera_name == name]) for name in names]
-    bodies = side_by_side(lambda own: _own_body(scene, own, moving), chosen)
-    return {name: body for name, body in zip(names, bodies, strict=True) if body.any()}
+    chosen = _far_apart_of_cameras(views)
+    bodies = side_by_side(lambda own: _own_body(scene, own, moving), list(chosen.values()))
+    return {name: body for name, body in zip(chosen, bodies, strict=True) if body.any()}
 
 
 def cannot_be_told(views: Sequence[RecordedView]) -> dict[str, str]:
     """Why the search could not look, by the cameras of which it cannot tell."""
-    names = sorted({view.camera_name for view in views})
-    whys = {name: _too_little([v for v in views if v.camera_name == name]) for name in names}
+    whys = {name: _too_little(apart) for name, apart in _far_apart_of_cameras(views).items()}
     return {name: why for name, why in whys.items() if why is not None}
 
 
@@ -96,8 +94,7 @@ def behind_traffic(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[s
     """
     moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
     shares = {}
-    for name in sorted({view.camera_name for view in views}):
-        own = _far_apart([view for view in views if view.camera_name == name])
+    for name, own in _far_apart_of_cameras(views).items():
         cameras = _compared(own)
         pixels = [
             moving.pixels(camera, view.timestamp_ns).numpy()
@@ -109,9 +106,8 @@ def behind_traffic(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[s
     return {name: share for name, share in shares.items() if share >= LEAST_HIDDEN}
 
 
-def _too_little(views: Sequence[RecordedView]) -> str | None:
-    """What keeps the search from looking at a camera's views."""
-    apart = _far_apart(views)
+def _too_little(apart: Sequence[RecordedView]) -> str | None:
+    """What keeps the search from looking at a camera's views that are far apart."""
     if len(apart) < LEAST_IMAGES:
         return f"{len(apart)} images taken apart, {LEAST_IMAGES} needed"
     cameras = _compared(apart)
@@ -164,17 +160,23 @@ def on_grid(
     return torch.from_numpy(resized > 0)
 
 
+def _far_apart_of_cameras(views: Sequence[RecordedView]) -> dict[str, list[RecordedView]]:
+    """Some of each camera's views, evenly over the way."""
+    names = sorted({view.camera_name for view in views})
+    return {name: _far_apart([v for v in views if v.camera_name == name]) for name in names}
+
+
 def _far_apart(views: Sequence[RecordedView]) -> list[RecordedView]:
-    """Some of a camera's views, evenly over the way."""
     kept: list[RecordedView] = []
     for view in sorted(views, key=lambda view: view.timestamp_ns):
-        if not kept or _baseline_m(kept[-1].camera, view.camera) >= LEAST_BASELINE_M:
+        if not kept or baseline_m(kept[-1], view) >= LEAST_BASELINE_M:
             kept.append(view)
     return kept[:: max(1, -(-len(kept) // MOST_IMAGES))]
 
 
-def _baseline_m(first: Camera, second: Camera) -> float:
-    return float((first.centre_world - second.centre_world).norm())
+def baseline_m(first: RecordedView, second: RecordedView) -> float:
+    """How far the cameras of two views stand from each other."""
+    return float((first.camera.centre_world - second.camera.centre_world).norm())
 
 
 def _way(cameras: Sequence[Camera], place: int) -> Float[np.ndarray, "3"]:

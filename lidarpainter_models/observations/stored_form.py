@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.geometry.cameras import LENS, Camera, Shutter
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import faults_from_records
@@ -15,7 +15,6 @@ from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_
 from lidarpainter_models.storage.tensor_files import grouped
 
 SCHEMA = 1
-_LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _IMAGES = ("rgb_u8", "sky_mask", "lidar_depth_m")
 
 
@@ -41,7 +40,7 @@ def observations_to_arrays(
         if view.hidden is not None and view.hidden is not bodies.get(view.key[1]):
             arrays[f"view.{index}.hidden"] = view.hidden.contiguous()
         arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
-        lens = {name: getattr(view.camera, name) for name in _LENS}
+        lens = {name: getattr(view.camera, name) for name in LENS}
         record = {"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens}
         record["exposure_rgb"] = list(view.exposure_rgb)
         shutter = view.camera.shutter

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch, moved, stack_conditions
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
-from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.painter.render_damage import damage_render
 from lidarpainter_models.painter.styles import StyleView, apply_style
 
@@ -266,14 +266,10 @@ def styled_pair(pair: PaintingPair, prompt: str, generator: Generator) -> Painti
 def target_view(pair: PaintingPair) -> StyleView:
     """The target with the depth and the sky of its view."""
     old = pair.conditions
+    below_a_hit = old.lidar_hit.int().cumsum(dim=0) > 0
     return StyleView(
         rgb=pair.target_rgb,
         depth_m=torch.where(old.lidar_hit, old.lidar_depth_m, old.render_depth_m),
-        sky=_sky(old),
+        # what the Gaussians leave open, above the topmost LiDAR hit of its column
+        sky=torch.where(below_a_hit, 0.0, 1 - old.render_alpha.clamp(0, 1)),
     )
-
-
-def _sky(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
-    """What the Gaussians leave open, above the topmost LiDAR hit of its column."""
-    below_a_hit = conditions.lidar_hit.int().cumsum(dim=0) > 0
-    return torch.where(below_a_hit, 0.0, 1 - conditions.render_alpha.clamp(0, 1))

@@ -7,8 +7,6 @@ is: it is meant for weighting guidance.
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 
@@ -61,12 +59,8 @@ class WarpPainter:
         total = conditions.render_rgb + (conditions.warp_rgb * valid).sum(dim=0)
         gaps = (conditions.warp_rgb - conditions.render_rgb).abs() * valid
         gap = (gaps.sum(dim=0) / count.clamp_min(1)).mean(dim=-1)
-        confidence = _support(gap) * (count[..., 0] > 0)
+        confidence = torch.exp(-gap / DISAGREEMENT_SCALE) * (count[..., 0] > 0)
         return Painting(rgb=total / (1 + count), confidence=confidence)
-
-
-def _support(difference: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    return torch.exp(-difference / DISAGREEMENT_SCALE)
 
 
 RULES: dict[str, Callable[[], Painter]] = {

@@ -65,21 +65,16 @@ class PairSource(Protocol):
 
     def __len__(self) -> int:
         """Number of pairs."""
-        ...
 
     @property
     def digest(self) -> str:
         """Says exactly which pairs these are."""
-        ...
 
     def size_px(self, index: int) -> tuple[int, int]:
         """Height and width of a pair."""
-        ...
 
     def read(self, index: int, window: Window | None = None) -> PaintingPair:
         """A pair, or the part of it inside a window."""
-        ...
 
     def describe(self) -> dict[str, Any]:
         """Where the pairs come from, as JSON types."""
-        ...

@@ -68,4 +68,3 @@ class Painter(Protocol):
 
     def paint(self, conditions: PaintingConditions) -> Painting:
         """Repair one view."""
-        ...

@@ -26,16 +26,6 @@ def damage_render(
     return render
 
 
-def random_blobs(
-    height_px: int, width_px: int, share: float, generator: Generator
-) -> Bool[Tensor, "height width"]:
-    """Smooth random blobs that cover about `share` of the image."""
-    rows, columns = max(height_px // 14, 2), max(width_px // 14, 2)
-    coarse = torch.randn(1, 1, rows, columns, generator=generator)
-    smooth = F.interpolate(coarse, size=(height_px, width_px), mode="bicubic")[0, 0]
-    return smooth > smooth.flatten().quantile(1 - share)
-
-
 def _speckle(
     render: Float[Tensor, "3 height width"], generator: Generator
 ) -> Float[Tensor, "3 height width"]:
@@ -99,8 +89,13 @@ def _needles(
 def _some_blobs(
     render: Float[Tensor, "3 height width"], generator: Generator
 ) -> Bool[Tensor, "height width"]:
+    """Smooth random blobs that cover a part of the image."""
     share = _between(0.03, 0.35, generator)
-    return random_blobs(render.shape[1], render.shape[2], share, generator)
+    _, height_px, width_px = render.shape
+    rows, columns = max(height_px // 14, 2), max(width_px // 14, 2)
+    coarse = torch.randn(1, 1, rows, columns, generator=generator)
+    smooth = F.interpolate(coarse, size=(height_px, width_px), mode="bicubic")[0, 0]
+    return smooth > smooth.flatten().quantile(1 - share)
 
 
 def _between(low: float, high: float, generator: Generator) -> float:

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.weather.light import luminance
+
 LEAST_CONTRAST = 0.02
 """What the eye can just tell from the horizon, in the definition of visibility."""
 FOG_LAYER_M = 120.0
@@ -42,3 +44,15 @@ def transmittance(
 def rain_extinction_per_m(rain_mm_per_h: float) -> float:
     """Of the veil of far drops: 0.312 R^0.67 per km (Rensch and Long, 1970)."""
     return 0.312e-3 * rain_mm_per_h**0.67
+
+
+def overcast(light: Float[Tensor, "*grid 3"]) -> Float[Tensor, "*grid 3"]:
+    """Light of surfaces under rain clouds, by that of a clear day."""
+    grey = luminance(light)[..., None]
+    dull = OVERCAST * (grey + COLOUR_WITHOUT_SUN * (light - grey))
+    return dull * light.new_tensor(OVERCAST_TINT)
+
+
+def cloud_light(like: Tensor) -> Float[Tensor, "3"]:
+    """Of the overcast sky, where another tensor lies."""
+    return CLOUD_LIGHT * like.new_tensor(OVERCAST_TINT)

@@ -233,12 +233,6 @@ def _spread_cameras(views: Sequence[TrainingView]) -> tuple[list[Camera], list[i
     return [camera for camera, _ in chosen], [images for _, images in chosen]
 
 
-def _some_of_each_camera(views: Sequence[TrainingView]) -> list[TrainingView]:
-    """A few views of each camera, evenly over the log."""
-    cameras = [view.key[1] for view in views]
-    return [views[row] for row in rows_of_each(cameras, OUTLINE_VIEWS_PER_CAMERA)]
-
-
 def _on_surfaces(
     observations: SceneObservations,
     config: InitialisationConfig,
@@ -253,10 +247,10 @@ def _on_surfaces(
     bodies, budget = list(clouds)[1:], max(budget - for_aside, 1)
     seen = adaptive_voxels(list(clouds.values()), budget=budget)
     del street, clouds  # 20 bytes a point, which nobody asks any more
-    gaussians = within_outlines(
-        _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config),
-        _some_of_each_camera(observations.views),
-    )
+    views = observations.views
+    rows = rows_of_each([view.key[1] for view in views], OUTLINE_VIEWS_PER_CAMERA)
+    gaussians = _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config)
+    gaussians = within_outlines(gaussians, [views[row] for row in rows])
     for body, voxels in zip(bodies, seen[1:], strict=True):
         gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
     return gaussians

@@ -167,7 +167,9 @@ class LidarChannel:
             scene.gaussians.body_index.long(), torch.tensor(unswept, dtype=torch.int64)
         )
         if bool(rows.any()):
-            others = without_colours(scene.gaussians.select(rows.nonzero()[:, 0]))
+            others = scene.gaussians.select(rows.nonzero()[:, 0])
+            no_harmonics = torch.zeros(len(others), 0, 3)
+            others = replace(others, sh_dc=torch.zeros(len(others), 1, 3), sh_rest=no_harmonics)
             surfels = joined_gaussians([surfels, others])
             usual = channels.median(dim=0).values.expand(len(others), 2)
             channels = torch.cat([channels, usual])
@@ -306,9 +308,3 @@ def in_bodies_of(
     kept = (body >= 0).nonzero()[:, 0]
     found = surfels.select(kept)
     return replace(found, body_index=body[kept].to(found.body_index)), kept
-
-
-def without_colours(gaussians: GaussianSet) -> GaussianSet:
-    """The same Gaussians in one colour, to stand beside surfels."""
-    count = len(gaussians)
-    return replace(gaussians, sh_dc=torch.zeros(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))

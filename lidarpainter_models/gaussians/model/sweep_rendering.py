@@ -80,7 +80,8 @@ def trace_sweep(
 
     found = list(side_by_side(traced, pieces, scene.device))
     if not found:
-        return trace_rays(_no_rays(), whole.ellipsoids, most_hits=most_hits)
+        no_rays = Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+        return trace_rays(no_rays, whole.ellipsoids, most_hits=most_hits)
     rows = torch.cat([piece.rows for piece in pieces])
     back = torch.empty_like(rows)
     back[rows] = torch.arange(len(rows))
@@ -89,10 +90,6 @@ def trace_sweep(
     return RayReturns(
         **rest, hits=RayHits(*(torch.cat(column)[back] for column in zip(*hits, strict=True)))
     )
-
-
-def _no_rays() -> Rays:
-    return Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
 
 
 def _pieces(rays: SweepRays) -> Iterator[_Piece]:

@@ -113,9 +113,9 @@ def build_candidates(
         for source in range(num_sources):
             made[f"warp_{source + 1}"] = conditions.warp[:, source]
             exists[f"warp_{source + 1}"] = conditions.warp_valid[:, source]
-        made["mean"] = mean_of_render_and_warps(
-            conditions.render, conditions.warp, conditions.warp_valid
-        )
+        valid = conditions.warp_valid
+        total = conditions.render + (conditions.warp * valid[:, :, None]).sum(dim=1)
+        made["mean"] = total / (1 + valid.sum(dim=1, keepdim=True))
         made["warp_1_blurred"] = masked_blur(conditions.warp[:, 0], conditions.warp_valid[:, :1])
         exists["warp_1_blurred"] = conditions.warp_valid[:, 0]
     if "reference" in inputs:
@@ -151,13 +151,3 @@ def with_flat_colour(
         images=(*candidates.images, flat),
         exists=candidates.exists | {name: somewhere},
     )
-
-
-def mean_of_render_and_warps(
-    render: Float[Tensor, "batch 3 height width"],
-    warp: Float[Tensor, "batch sources 3 height width"],
-    warp_valid: Float[Tensor, "batch sources height width"],
-) -> Float[Tensor, "batch 3 height width"]:
-    """The mean of the render and of the warps that are valid in a pixel."""
-    total = render + (warp * warp_valid[:, :, None]).sum(dim=1)
-    return total / (1 + warp_valid.sum(dim=1, keepdim=True))

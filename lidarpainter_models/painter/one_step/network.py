@@ -60,7 +60,8 @@ class OneStepNetwork(nn.Module):
         latents, skips = self._encode(images, encodes_at_once=encodes_at_once)
         weights = self._weights(latents)
         fused = mix(weights, latents.float())
-        seen = fused if self.config.denoiser_sees == "fused" else _side_by_side(latents)
+        side_by_side = latents.transpose(0, 1).flatten(1, 2)
+        seen = fused if self.config.denoiser_sees == "fused" else side_by_side
         if masks is not None:
             seen = torch.cat([seen, masks.to(seen.dtype)], dim=1)
         predicted = self.denoiser(seen, text)
@@ -98,9 +99,3 @@ class OneStepNetwork(nn.Module):
         weights = torch.zeros_like(latents[:, :, :1], dtype=torch.float32)
         weights[0] = 1
         return weights
-
-
-def _side_by_side(
-    latents: Float[Tensor, "inputs batch 4 rows columns"],
-) -> Float[Tensor, "batch channels rows columns"]:
-    return latents.transpose(0, 1).flatten(1, 2)

@@ -26,14 +26,8 @@ from lidarpainter_models.painter.styles.view import (
     ray_directions,
     surface_points,
 )
-from lidarpainter_models.weather.air import (
-    CLOUD_LIGHT,
-    COLOUR_WITHOUT_SUN,
-    OVERCAST,
-    OVERCAST_TINT,
-    rain_extinction_per_m,
-)
-from lidarpainter_models.weather.light import luminance, to_display, to_linear
+from lidarpainter_models.weather.air import cloud_light, overcast, rain_extinction_per_m
+from lidarpainter_models.weather.light import to_display, to_linear
 from lidarpainter_models.weather.water import (
     FILM_SHINE,
     PUDDLE_SHARE,
@@ -154,16 +148,14 @@ def _wet(
     view: StyleView, dry: Float[Tensor, "height width 3"], place: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Everything but the streaks."""
-    tint = torch.tensor(OVERCAST_TINT)
-    grey = luminance(dry)[..., None]
-    dull = OVERCAST * (grey + COLOUR_WITHOUT_SUN * (dry - grey)) * tint
+    dull, clouds = overcast(dry), cloud_light(dry)
     walls = wet_reflectance(dull, 0.5 * WETNESS)
-    light = walls + open_sky(view)[..., None] * (CLOUD_LIGHT * tint - walls)
+    light = walls + open_sky(view)[..., None] * (clouds - walls)
     distance_m = distances(view)
     light = _with_wet_road(light, dull, view, distance_m, place)
     through = torch.exp(-rain_extinction_per_m(RAIN_MM_PER_H) * distance_m)
     through = torch.where(view.surface, through, 1.0)[..., None]
-    return light * through + CLOUD_LIGHT * tint * (1 - through)
+    return light * through + clouds * (1 - through)
 
 
 def _with_wet_road(
@@ -181,8 +173,7 @@ def _with_wet_road(
         return light
     share = ground_pixels(points_m, ground, view.surface)
     points_m = ground.flattened(points_m)
-    cloud = CLOUD_LIGHT * torch.tensor(OVERCAST_TINT)
-    mirror = mirrored(light, cloud, camera, points_m, share > 0.01)
+    mirror = mirrored(light, cloud_light(light), camera, points_m, share > 0.01)
     centre_m = camera.world_from_camera[:3, 3].float()
     still = puddles(points_m + centre_m, place, share=PUDDLE_SHARE)
     shine = fresnel(-ray_directions(camera)[..., 2])

@@ -59,7 +59,6 @@ class Trainee(Protocol):
         `share` is how much the batch counts among those of the step. Returns what enters the
         history; `total` is the loss, and has to be finite.
         """
-        ...
 
     def check(self, step: int, means: Mapping[str, float]) -> None:
         """Look at an entry of the history.
@@ -67,7 +66,6 @@ class Trainee(Protocol):
         Raises:
             TrainingError: the network has died.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

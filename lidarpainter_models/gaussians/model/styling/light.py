@@ -15,14 +15,12 @@ from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle, 
 from lidarpainter_models.gaussians.model.styling.traits import SurfaceTraits
 from lidarpainter_models.kernels.scene_light import LEAST_BASE, Appearance, Surroundings, irradiance
 from lidarpainter_models.weather.air import (
-    CLOUD_LIGHT,
-    COLOUR_WITHOUT_SUN,
     FOG_BRIGHTNESS,
     FOG_GREYNESS,
     FOG_LAYER_M,
-    OVERCAST,
-    OVERCAST_TINT,
+    cloud_light,
     extinction_per_m,
+    overcast,
     rain_extinction_per_m,
 )
 from lidarpainter_models.weather.darkness import (
@@ -110,10 +108,7 @@ def _overcast(
     light: Float[Tensor, "*grid 3"], wetness: Float[Tensor, "*#grid 1"]
 ) -> Float[Tensor, "*grid 3"]:
     """Wet surfaces under clouds."""
-    grey = luminance(light)[..., None]
-    tint = light.new_tensor(OVERCAST_TINT)
-    dull = OVERCAST * (grey + COLOUR_WITHOUT_SUN * (light - grey)) * tint
-    return _wetted(dull, wetness)
+    return _wetted(overcast(light), wetness)
 
 
 def _wetted(
@@ -131,9 +126,8 @@ def _airlight(style: SceneStyle, strengths: Mapping[str, float]) -> Float[Tensor
     """Light of the air: of the horizon, of clouds in rain, of the town at night."""
     horizon = style.place.horizon_light
     grey = horizon + FOG_GREYNESS * (luminance(horizon) - horizon)
-    clouds = CLOUD_LIGHT * horizon.new_tensor(OVERCAST_TINT)
     day = FOG_BRIGHTNESS * grey
-    day = day + strengths.get("rain", 0.0) * (clouds - day)
+    day = day + strengths.get("rain", 0.0) * (cloud_light(horizon) - day)
     return day + strengths.get("night", 0.0) * (night_sky(horizon.new_zeros(())) - day)
 
 
@@ -142,7 +136,7 @@ def _surroundings(
 ) -> Surroundings:
     rain, night = strengths.get("rain", 0.0), strengths.get("night", 0.0)
     horizon = style.place.horizon_light
-    clouds = CLOUD_LIGHT * horizon.new_tensor(OVERCAST_TINT)
+    clouds = cloud_light(horizon)
     overhead = clouds + night * (night_sky(horizon.new_tensor(MIRRORED_SKY_RAD)) - clouds)
     around = _overcast(traits.skylines.day_light, horizon.new_tensor([[[0.5 * WETNESS]]]))
     reflectance = night_reflectance(traits.skylines.day_light, float(style.place.white))
@@ -161,9 +155,8 @@ def _styled_sky(sky: SkyTexture, style: SceneStyle, strengths: Mapping[str, floa
     layout, rgb = sky.layout, sky.rgb.detach()
     rows = torch.arange(layout.rows, device=rgb.device, dtype=rgb.dtype) + 0.5
     elevation = layout.elevation_top_rad - rows * layout.texel_rad
-    clouds = CLOUD_LIGHT * rgb.new_tensor(OVERCAST_TINT)
     light = to_linear(rgb)
-    light = light + strengths.get("rain", 0.0) * (clouds - light)
+    light = light + strengths.get("rain", 0.0) * (cloud_light(rgb) - light)
     light = light + strengths.get("night", 0.0) * (night_sky(elevation)[:, None] - light)
     path_m = FOG_LAYER_M / elevation.clamp(1e-3, math.pi / 2).sin()
     through = torch.exp(-_fog_extinction(style, strengths) * path_m)[:, None, None]
