@@ -25,12 +25,17 @@ def saved(tmp_path):
     return network, path
 
 
-def rewrite(path, change):
-    with safe_open(path, "pt") as file:
-        header = json.loads(file.metadata()["lidarpainter"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    change(header, tensors)
-    save_file(tensors, path, {"lidarpainter": json.dumps(header)})
+def rewriting(change):
+    """What changes the header and the tensors of a file."""
+
+    def rewrite(path):
+        with safe_open(path, "pt") as file:
+            header = json.loads(file.metadata()["lidarpainter"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        change(header, tensors)
+        save_file(tensors, path, {"lidarpainter": json.dumps(header)})
+
+    return rewrite
 
 
 def test_weights_survive_the_round_trip(saved, make_conditions):
@@ -53,51 +58,33 @@ def test_full_size_weights_stay_small(tmp_path):
     assert path.stat().st_size < 5.5e6
 
 
-def damaged(path):
-    path.write_bytes(path.read_bytes()[:100])
-
-
-def foreign(path):
-    rewrite(path, lambda header, _: header.update(format="other/3"))
-
-
-def settings_of_nothing(path):
-    rewrite(path, lambda header, _: header.update(config={}))
-
-
-def wider(path):
-    config = NanoConfig(widths=(16, 8, 8), blocks=(1, 1, 1)).to_dict()
-    rewrite(path, lambda header, _: header.update(config=config))
-
-
-def unlicensed(path):
-    rewrite(path, lambda header, _: header.pop("licence"))
-
-
-def unmarked(path):
-    rewrite(path, lambda header, _: header.clear())
-
-
-def incomplete(path):
-    rewrite(path, lambda _, tensors: tensors.pop("head.bias"))
-
-
-def not_finite(path):
-    rewrite(path, lambda _, tensors: tensors["head.bias"].fill_(torch.nan))
+WIDER = NanoConfig(widths=(16, 8, 8), blocks=(1, 1, 1))
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda path: path.unlink(), "is not there"),
-        (damaged, "not a readable safetensors file"),
-        (foreign, "has 'other/3', expected 'lidarpainter-nano/1'"),
-        (settings_of_nothing, "unusable settings"),
-        (wider, "expected"),
-        (unlicensed, "lacks"),
-        (unmarked, "has 'no format mark'"),
-        (incomplete, "tensor 'head.bias' has shape None"),
-        (not_finite, "values that are no number"),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:100]),
+            "not a readable safetensors file",
+        ),
+        (
+            rewriting(lambda header, _: header.update(format="other/3")),
+            "has 'other/3', expected 'lidarpainter-nano/1'",
+        ),
+        (rewriting(lambda header, _: header.update(config={})), "unusable settings"),
+        (rewriting(lambda header, _: header.update(config=WIDER.to_dict())), "expected"),
+        (rewriting(lambda header, _: header.pop("licence")), "lacks"),
+        (rewriting(lambda header, _: header.clear()), "has 'no format mark'"),
+        (
+            rewriting(lambda _, tensors: tensors.pop("head.bias")),
+            "tensor 'head.bias' has shape None",
+        ),
+        (
+            rewriting(lambda _, tensors: tensors["head.bias"].fill_(torch.nan)),
+            "values that are no number",
+        ),
     ],
 )
 def test_wrong_weights_files_are_one_clear_line(saved, spoil, message):
