@@ -19,7 +19,7 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef
 from catalog.deletion import KEYS
-from catalog.digests import digest_file
+from catalog.digests import file_facts
 from catalog.errors import CatalogError, UnknownRecordError, storage_errors
 from catalog.needs import Needs
 from catalog.store import Store
@@ -83,13 +83,7 @@ def write_archive(store: Store, selection: Selection, out: Path) -> int:
     for row in selection.rows["artefacts"]:
         store.artefacts.verified(ArtefactRef.of_id(row["artefact_id"]))
     paths = [path for folder in selection.folders for path in _files(folder)]
-    files = {
-        path.relative_to(store.root).as_posix(): {
-            "num_bytes": path.stat().st_size,
-            "sha256": digest_file(path),
-        }
-        for path in paths
-    }
+    files = {path.relative_to(store.root).as_posix(): file_facts(path) for path in paths}
     content = {
         "version": ARCHIVE_VERSION,
         "rows": {
@@ -106,11 +100,11 @@ def write_archive(store: Store, selection: Selection, out: Path) -> int:
                 tar.addfile(_entry(ARCHIVE_MANIFEST, len(manifest)), io.BytesIO(manifest))
                 for path, name in zip(paths, files, strict=True):
                     with path.open("rb") as file:
-                        tar.addfile(_entry(name, path.stat().st_size), file)
+                        tar.addfile(_entry(name, files[name]["num_bytes"]), file)
             aside.replace(out)
         finally:
             aside.unlink(missing_ok=True)
-    return sum(path.stat().st_size for path in paths)
+    return sum(facts["num_bytes"] for facts in files.values())
 
 
 def _files(folder: Path) -> list[Path]:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from catalog.code_closure import Code
-from catalog.digests import canonical_json, digest_file, digest_text, plain
+from catalog.digests import canonical_json, digest_file, digest_text, file_facts, plain
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
 from catalog.locks import held_lock
 
@@ -275,10 +275,7 @@ def _write_manifest(
     output: Path, recipe: Recipe, summary: Mapping[str, Any], seconds: float
 ) -> None:
     files = {
-        path.relative_to(output).as_posix(): {
-            "num_bytes": path.stat().st_size,
-            "sha256": digest_file(path),
-        }
+        path.relative_to(output).as_posix(): file_facts(path)
         for path in sorted(output.rglob("*"))
         if path.is_file()
     }

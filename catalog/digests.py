@@ -33,6 +33,11 @@ def digest_file(path: Path) -> str:
     return sha.hexdigest()
 
 
+def file_facts(path: Path) -> dict[str, Any]:
+    """What manifests and listings hold of a file: `num_bytes` and `sha256`."""
+    return {"num_bytes": path.stat().st_size, "sha256": digest_file(path)}
+
+
 def canonical_json(value: Any) -> str:  # noqa: ANN401 - any configuration
     """The one JSON text of a configuration: sorted keys, no spaces, finite numbers.
 

@@ -29,9 +29,7 @@ def held_lock(path: Path, *, on_wait: Callable[[str], None] | None = None) -> It
     Raises:
         StorageError: the lock file cannot be made.
     """
-    with storage_errors(f"cannot lock {path}"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = open_lock(path)
     try:
         waited = _acquire(descriptor, on_wait)
         os.ftruncate(descriptor, 0)
@@ -48,14 +46,23 @@ def shared_lock(path: Path) -> Iterator[None]:
     Raises:
         StorageError: the lock file cannot be made.
     """
-    with storage_errors(f"cannot lock {path}"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = open_lock(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH)
         yield
     finally:
         os.close(descriptor)
+
+
+def open_lock(path: Path, access: int = os.O_RDWR) -> int:
+    """The descriptor of a lock file, made where it is not there.
+
+    Raises:
+        StorageError: it cannot be made.
+    """
+    with storage_errors(f"cannot lock {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(path, access | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
 
 def is_held(path: Path) -> bool:

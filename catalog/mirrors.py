@@ -26,10 +26,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from catalog.buckets import SCHEME, Bucket
-from catalog.digests import digest_file
+from catalog.digests import file_facts
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
-from catalog.folders import cache_folder
-from catalog.locks import held_lock
+from catalog.folders import cache_folder, changed_at
+from catalog.locks import held_lock, open_lock
 
 LIMIT_ENVIRONMENT = "LIDARPAINTER_CACHE_GB"
 DEFAULT_LIMIT_GB = 20.0
@@ -152,10 +152,7 @@ class Mirror:
         with ThreadPoolExecutor(AT_ONCE) as pool:
             send = self.bucket.upload
             list(pool.map(lambda one: send(f"{entry}/{place}/{one[0]}", one[1]), files.items()))
-        known = {
-            name: {"num_bytes": path.stat().st_size, "sha256": digest_file(path)}
-            for name, path in files.items()
-        }
+        known = {name: file_facts(path) for name, path in files.items()}
         content = json.dumps({"place": place, "files": known}, indent=1).encode()
         if self.bucket.write(_listing_name(entry), content, replacing=replacing) is None:
             self.bucket.remove(f"{entry}/{place}/{name}" for name in files)
@@ -183,7 +180,8 @@ class Mirror:
 
     def tidy(self) -> None:
         """Let go what was not used for longest, until no more is kept than is allowed."""
-        notes = sorted(self.root.glob(f"{LISTINGS}/**/*.json"), key=_used_at)
+        # a note is touched when its entry is used; another process may have let go of it
+        notes = sorted(self.root.glob(f"{LISTINGS}/**/*.json"), key=changed_at)
         sizes = {note: self._kept_bytes(self._entry_of(note)) for note in notes}
         excess = sum(sizes.values()) - _limit_bytes()
         for note, num_bytes in sizes.items():
@@ -262,9 +260,7 @@ class Mirror:
         """Have an entry in use from now on, alone on this machine while the block runs."""
         path = self._lock_path(entry)
         if path not in _IN_USE:
-            with storage_errors(f"cannot lock {path}"):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                opened = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            opened = open_lock(path)
             fcntl.flock(opened, fcntl.LOCK_SH)
             if _IN_USE.setdefault(path, opened) != opened:  # another thread was faster
                 os.close(opened)
@@ -302,14 +298,6 @@ class EntryFiles:
             DamagedArtefactError: a file is not there or is not what was published.
         """
         self.mirror.bring(self.entry, self.listing, names)
-
-
-def _used_at(note: Path) -> float:
-    """When an entry was used last; long ago if another process has let go of it."""
-    try:
-        return note.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
 
 
 def _listing_name(entry: str) -> str:

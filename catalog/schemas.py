@@ -326,17 +326,5 @@ SIGHTINGS = TableSchema(
     ),
 )
 
-TABLES: dict[str, TableSchema] = {
-    table.name: table
-    for table in (
-        SCENES,
-        RUNS,
-        ARTEFACTS,
-        METRICS,
-        PAINTERS,
-        SEQUENCES,
-        ATTEMPTS,
-        ASSETS,
-        SIGHTINGS,
-    )
-}
+_ALL = (SCENES, RUNS, ARTEFACTS, METRICS, PAINTERS, SEQUENCES, ATTEMPTS, ASSETS, SIGHTINGS)
+TABLES: dict[str, TableSchema] = {table.name: table for table in _ALL}
