@@ -47,7 +47,8 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
         names = SIGHTINGS.arrow.names
         new: list[Row] = [{name: row.get(name) for name in names} for row in rows]
         known = store.tables.arrow(SIGHTINGS.name, where=_in_question(new))
-        old = _where(known, "sighting_id", [row["sighting_id"] for row in new])
+        is_old = _is_in(known, "sighting_id", {row["sighting_id"] for row in new})
+        old = known.filter(pa.array(is_old)).to_pylist()
         others = _leaving(_candidates(known, new), new)
         groups = _Groups()
         for row in old:
@@ -152,16 +153,11 @@ def _unique_ids(rows: Sequence[Row]) -> set[str]:
 
 def _candidates(known: pa.Table, new: Sequence[Row]) -> list[Row]:
     """The known sightings that one of some new ones may be of the same thing as."""
-    mask = np.zeros(known.num_rows, dtype=bool)
-    occurrences = {row["occurrence_id"] for row in new}
-    for column, names in (("occurrence_id", occurrences), ("actor_id", _unique_ids(new))):
-        is_in = pc.is_in(known[column], value_set=pa.array(names, pa.string()))
-        mask |= is_in.to_numpy(zero_copy_only=False).astype(bool)
+    mask = _is_in(known, "occurrence_id", {row["occurrence_id"] for row in new})
+    mask |= _is_in(known, "actor_id", _unique_ids(new))
     x_m, y_m = (known[name].to_numpy() for name in ("x_m", "y_m"))
     standing = [row for row in new if row["is_moving"] is False]
-    places = pa.array({row["frame"] for row in standing}, pa.string())
-    frames = pc.is_in(known["frame"], value_set=places)
-    here = np.flatnonzero(frames.to_numpy(zero_copy_only=False))
+    here = np.flatnonzero(_is_in(known, "frame", {row["frame"] for row in standing}))
     for row in standing:
         near = (abs(x_m[here] - row["x_m"]) < NEAR_M) & (abs(y_m[here] - row["y_m"]) < NEAR_M)
         mask[here[near]] = True
@@ -218,10 +214,10 @@ def _stored(
     return store.tables.rows(table, where={column: set(values)})
 
 
-def _where(table: pa.Table, column: str, values: Iterable[str]) -> list[Row]:
-    """The rows with one of these values in a column."""
-    wanted = pa.array(sorted(values), pa.string())
-    return table.filter(pc.is_in(table[column], value_set=wanted)).to_pylist()
+def _is_in(table: pa.Table, column: str, values: Iterable[str]) -> np.ndarray:
+    """Which rows have one of these values in a column."""
+    found = pc.is_in(table[column], value_set=pa.array(values, pa.string()))
+    return found.to_numpy(zero_copy_only=False).astype(bool)
 
 
 def _leaving(rows: Sequence[Row], out: Sequence[Row]) -> list[Row]:
