@@ -5,7 +5,6 @@ import json
 import tarfile
 
 import pytest
-from shop import Shop
 
 from catalog.archives import ARCHIVE_MANIFEST, select, write_archive
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError
@@ -16,10 +15,8 @@ TABLES = ("scenes", "artefacts", "painters", "metrics", "runs")
 
 
 @pytest.fixture(scope="module")
-def shop(tmp_path_factory):
-    made = Shop(tmp_path_factory.mktemp("shop"))
-    manifest = {"content_digest": "scene-digest"}
-    (made.store.root / "scenes/toy/street/manifest.json").write_text(json.dumps(manifest))
+def shop(first_shop, tmp_path_factory):
+    made = first_shop.copied(tmp_path_factory.mktemp("shop"))
     for run in made.store.tables.rows("runs"):
         made.change("runs", run["run_id"], result=json.dumps({"artefacts": {}}))
     return made

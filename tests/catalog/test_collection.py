@@ -7,7 +7,6 @@ import time
 from datetime import UTC, datetime, timedelta
 
 import pytest
-from shop import Shop
 
 from catalog.collection import plan_collection
 from catalog.deletion import delete
@@ -22,9 +21,9 @@ SINCE = NOW - timedelta(days=30)
 
 
 @pytest.fixture(scope="module")
-def old_shop(tmp_path_factory):
+def old_shop(first_shop, tmp_path_factory):
     """All of it is old, and no painter is in it."""
-    made = Shop(tmp_path_factory.mktemp("shop"))
+    made = first_shop.copied(tmp_path_factory.mktemp("shop"))
     made.store.tables.delete("painters", "painter_id", ["p1"])
     artefacts, runs = (made.store.tables.rows(table) for table in ("artefacts", "runs"))
     made.store.tables.merge("artefacts", [{**row, "created_at": LONG_AGO} for row in artefacts])

@@ -1,7 +1,6 @@
 """What is deleted is gone with what it alone needed; what others need stays."""
 
 import pytest
-from shop import Shop
 
 from catalog.deletion import delete
 from catalog.errors import CatalogError, UnknownRecordError
@@ -9,16 +8,6 @@ from catalog.errors import CatalogError, UnknownRecordError
 
 def ids(doomed):
     return {(one.table, one.row_id.split("/")[0]) for one in doomed}
-
-
-@pytest.fixture(scope="module")
-def first_shop(tmp_path_factory):
-    return Shop(tmp_path_factory.mktemp("shop"))
-
-
-@pytest.fixture
-def shop(first_shop, tmp_path):
-    return first_shop.copied(tmp_path)
 
 
 def test_a_run_goes_with_what_it_alone_needs(shop):

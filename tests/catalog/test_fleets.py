@@ -30,18 +30,6 @@ while waiting := [row for row in ledger.rows("night") if row["state"] == "waitin
 """
 
 
-class Clock:
-    now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-
-@pytest.fixture
-def clock():
-    return Clock()
-
-
 @pytest.fixture
 def ledger(tmp_path, clock):
     leases = Leases(FolderObjects(tmp_path / "leases"), time_to_live_s=60.0, now=clock)

@@ -32,18 +32,6 @@ for _ in range(5):
 """
 
 
-class Clock:
-    now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-
-@pytest.fixture
-def clock():
-    return Clock()
-
-
 @pytest.fixture
 def leases(tmp_path, clock):
     return Leases(FolderObjects(tmp_path), time_to_live_s=60.0, now=clock)

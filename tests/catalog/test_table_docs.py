@@ -20,6 +20,7 @@ def test_the_page_is_current():
 def test_every_column_is_described_once(table):
     names = [column.name for column in table.columns]
     assert len(set(names)) == len(names)
+    assert table.key.endswith("_id")
     for column in table.columns:
         assert column.description
         assert "|" not in column.description + column.unit

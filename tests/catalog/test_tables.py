@@ -10,7 +10,6 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 
 from catalog.errors import StorageError, UnknownRecordError
-from catalog.schemas import TABLES
 from catalog.tables import MOST_FILES, CatalogTables
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,13 +47,6 @@ def test_a_table_never_written_is_empty(tables):
     assert tables.rows("scenes") == []
     tables.merge("scenes", [])
     assert tables.rows("scenes") == []
-
-
-def test_every_column_has_a_description_and_ids_come_first():
-    for table in TABLES.values():
-        assert all(column.description for column in table.columns)
-        assert table.key.endswith("_id")
-        assert len({column.name for column in table.columns}) == len(table.columns)
 
 
 def test_descriptions_are_stored_with_the_columns(tables):

@@ -1,19 +1,6 @@
 """Every damage is named, and nothing else."""
 
-import pytest
-from shop import Shop
-
 from catalog.verification import verify
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    return Shop(tmp_path_factory.mktemp("shop"))
-
-
-@pytest.fixture
-def shop(whole, tmp_path):
-    return whole.copied(tmp_path)
 
 
 def damage(shop, check_scene=lambda _folder: None):
