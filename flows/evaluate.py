@@ -11,26 +11,15 @@ from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import (
     FLICKER,
-    MARKINGS,
-    NEURAD,
     Scores,
     fitted_on,
     flicker_by_image,
 )
-from tasks.evaluation.views import (
-    evaluate,
-    evaluate_by_neurad,
-    evaluate_flicker,
-    evaluate_markings,
-    evaluate_strips,
-    load_scores,
-)
+from tasks.evaluation.views import TRUTH, evaluate, evaluate_flicker, load_scores
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, open_run
 from tasks.specs import FittedRef
 
-CROSS_CAMERA = "cross-camera"
-TRUTH = "truth"
 VIEW_TIME = "view-time"
 
 
@@ -96,20 +85,15 @@ def _variants(
         judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged[VIEW_TIME] = finished.final
-    judges = {
-        CROSS_CAMERA: evaluate_strips,
-        NEURAD: evaluate_by_neurad,
-        MARKINGS: evaluate_markings,
-    }
-    judge = judges.get(request.protocol, evaluate)
     run = parameters.run_spec(store.address, painter=request.painter)
     scores = {}
     for name, fitted in judged.items():
-        made = judge.fn(
+        made = evaluate.fn(
             run,
             f"{request.protocol}-{name}",
             fitted,
             parameters.evaluation_config,
+            protocol=request.protocol,
             view_time=name == VIEW_TIME,
         )
         scores[name] = load_scores(store, made.ref)

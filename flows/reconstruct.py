@@ -23,7 +23,7 @@ from lidarpainter_models.observations.image_shrinking import require_recorded_wi
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope
-from tasks.evaluation.views import evaluate, evaluate_markings, load_scores
+from tasks.evaluation.views import evaluate, load_scores
 from tasks.lidar.channel import learn_lidar
 from tasks.lidar.evaluate import evaluate_lidar
 from tasks.opened import opened
@@ -221,8 +221,8 @@ def _judged(
         scores["painted"] |= load_scores(store, told.ref)
     if course.parameters.judge_markings:
         name, config = f"evaluate-{MARKINGS}", course.parameters.evaluation_config
-        told = course.add(name, evaluate_markings(course.run, name, final, config))
-        scores["painted"] |= load_scores(store, told.ref)
+        lines = evaluate(course.run, name, final, config, protocol=MARKINGS)
+        scores["painted"] |= load_scores(store, course.add(name, lines).ref)
     return scores
 
 

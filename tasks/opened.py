@@ -23,7 +23,7 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME, MANIFEST_NAME
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 from lidarpainter_models.scenes.stored import Fetch
-from tasks.specs import RunSpec, SplitSpec
+from tasks.specs import FittedRef, RunSpec, SplitSpec
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +40,15 @@ class OpenedRun:
     def painter(self) -> PainterChoice:
         """Who paints; loaded at its first painting."""
         return PainterChoice.of(self.spec.painter)
+
+    def inputs(self, fitted: FittedRef, *, paints: bool = False) -> dict[str, str]:
+        """Digests of what a stage reads of a fitted scene, by the part each plays."""
+        digests = {
+            "scene": self.scene.content_digest,
+            "observations": fitted.observations.digest,
+            "gaussians": fitted.gaussians.digest,
+        }
+        return digests | ({"painter": self.painter.digest} if paints else {})
 
     def held_out(self, observation: ObservationConfig, *, or_train: bool = False) -> HeldOut:
         """The views that no fit saw; with `or_train` those it saw, where it saw all."""

@@ -16,7 +16,7 @@ from catalog.errors import CatalogError
 from catalog.points import Point, points_of
 from catalog.store import Store
 from catalog.tables import Row
-from flows.evaluate import CROSS_CAMERA, EvaluationRequest, evaluate_run
+from flows.evaluate import VIEW_TIME, EvaluationRequest, evaluate_run
 from flows.fleet.manifest import STORED
 from flows.measure.figure_manifest import (
     Cell,
@@ -41,14 +41,12 @@ from flows.measure.tables import (
 from lidarpainter_models.errors import ConfigError, LidarPainterError, SceneError
 from lidarpainter_models.evaluation.score_tables import FLICKER, MARKINGS, NEURAD
 from lidarpainter_models.storage.whole_files import write_whole
+from tasks.evaluation.views import CROSS_CAMERA, PAPER
 from tasks.machine import machine
 from tasks.opened import open_scene
 
-PAPER = "paper"
-"""The protocol of what is under no other."""
 ON_REQUEST = {CROSS_CAMERA, FLICKER, MARKINGS, NEURAD}
 """Protocols that no run is judged by as it ends."""
-VIEW_TIME = "view-time"
 DIGITS = 8
 """Significant digits of a figure in the record."""
 CODE_DIGITS = 12

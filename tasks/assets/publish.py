@@ -42,11 +42,7 @@ def publish_assets(
         kernels=run.kernels,
         stage="publish-assets",
         kind=KIND,
-        inputs={
-            "scene": this.scene.content_digest,
-            "observations": finished.final.observations.digest,
-            "gaussians": finished.final.gaussians.digest,
-        },
+        inputs=this.inputs(finished.final),
         config={"split": run.split, "observation": observation},
         build=partial(_build, this=this, finished=finished, observation=observation),
     )

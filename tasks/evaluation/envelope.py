@@ -19,7 +19,6 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.score_tables import ENVELOPE, HELD_OUT, least_of
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.view_confidence import BUNDLED
-from tasks.evaluation.views import evaluation_inputs
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -43,7 +42,7 @@ def find_envelope(run: RunSpec, fitted: FittedRef, config: EvaluationConfig) -> 
         kernels=run.kernels,
         stage=STAGE,
         kind=ENVELOPE,
-        inputs=evaluation_inputs(this, fitted, view_time=False),
+        inputs=this.inputs(fitted),
         config={"split": run.split, "observation": asdict(config.observation)},
         build=partial(
             _build,

@@ -8,7 +8,6 @@ import torch
 from catalog.store import Store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.settings import ConditionConfig
-from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.observations.views import SceneObservations
@@ -16,14 +15,6 @@ from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import OpenedRun
 from tasks.specs import FittedRef
 from tasks.stored import load_observations, load_scene
-
-
-def shown_by(
-    this: OpenedRun, fitted: FittedRef, config: EvaluationConfig, *, view_time: bool
-) -> Callable[[], ShownScene]:
-    """Opens a fitted scene as it is, or as the run's painter paints it at view time."""
-    painter = this.painter if view_time else None
-    return partial(shown_scene, this.store, fitted, config.conditions, painter, this.device)
 
 
 def painted_by(

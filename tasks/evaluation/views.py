@@ -25,7 +25,7 @@ from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.evaluation.strips import StripEvaluation
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics.perceptual import load_distances
-from tasks.evaluation.shown import painted_by, shown_by
+from tasks.evaluation.shown import painted_by, shown_scene
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -34,6 +34,8 @@ from tasks.stages import StageResult, run_stage, stage_task
 from tasks.weights import file_digests
 
 SCORES_FILE = "scores.json"
+PAPER, TRUTH, CROSS_CAMERA = "paper", "truth", "cross-camera"
+"""Protocols beside those that `score_tables` names."""
 
 
 @stage_task
@@ -43,79 +45,27 @@ def evaluate(
     fitted: FittedRef,
     config: EvaluationConfig,
     *,
+    protocol: str = PAPER,
     view_time: bool = False,
 ) -> StageResult:
-    """Score a scene as it is, or what it shows once the run's painter has painted it."""
-    held_out = opened(run).held_out(config.observation)
-    build = partial(_build, evaluation=SceneEvaluation(held_out=held_out, config=config))
-    more = {"scoring": asdict(config.scoring)}
-    asked = _Asked(run, stage, fitted, config, view_time)
-    return _judged(asked, build, more=more, weights=config.weight_files)
-
-
-@stage_task
-def evaluate_by_neurad(
-    run: RunSpec,
-    stage: str,
-    fitted: FittedRef,
-    config: EvaluationConfig,
-    *,
-    view_time: bool = False,
-) -> StageResult:
-    """Score every held-out image by the protocol of neurad-studio.
+    """Score a scene as it is, or what it shows once the run's painter has painted it.
 
     Raises:
-        ConfigError: the run was not fitted to the split of that protocol.
-    """
-    if run.split.spec != SPLIT:
-        raise ConfigError(
-            f"--protocol {NEURAD} judges runs that were fitted with --split {SPLIT}, this one was "
-            f"with --split {run.split.spec}"
-        )
-    held_out = opened(run).held_out(config.observation)
-    build = partial(_build_neurad, held_out=held_out, config=config)
-    asked = _Asked(run, stage, fitted, config, view_time)
-    return _judged(asked, build, weights=config.weight_files)
-
-
-@stage_task
-def evaluate_markings(
-    run: RunSpec,
-    stage: str,
-    fitted: FittedRef,
-    config: EvaluationConfig,
-    *,
-    view_time: bool = False,
-) -> StageResult:
-    """Score the painted lines that a scene shows on its path and beside it."""
-    held_out, shifts = opened(run).held_out(config.observation), config.scoring.shifts
-    build = partial(_build_markings, held_out=held_out, shifts=shifts)
-    more = {"shifts": [asdict(shift) for shift in shifts]}
-    return _judged(_Asked(run, stage, fitted, config, view_time), build, more=more)
-
-
-@stage_task
-def evaluate_strips(
-    run: RunSpec,
-    stage: str,
-    fitted: FittedRef,
-    config: EvaluationConfig,
-    *,
-    view_time: bool = False,
-) -> StageResult:
-    """Score held-out frames of every camera that the fit did not see.
-
-    Raises:
-        ConfigError: the fit saw every camera of the scene.
+        ConfigError: the scene cannot be judged under this protocol.
     """
     this = opened(run)
-    evaluation = StripEvaluation(held_out=this.held_out(config.observation), views=this.views)
-    if not evaluation.cameras:
-        raise ConfigError(
-            f"the fit saw every camera of {run.split.scene_id}; leave one out with --train-cameras"
-        )
-    build = partial(_build_strips, evaluation=evaluation)
-    return _judged(_Asked(run, stage, fitted, config, view_time), build, kind="strips")
+    judge = JUDGES[protocol](this, config)
+    painter = this.painter if view_time else None
+    shown = partial(shown_scene, this.store, fitted, config.conditions, painter, this.device)
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind=judge.kind,
+        inputs=this.inputs(fitted, paints=view_time) | file_digests(judge.weights),
+        config=_settings(run, config) | dict(judge.settings),
+        build=partial(judge.build, shown=shown),
+    )
 
 
 @stage_task
@@ -137,7 +87,7 @@ def evaluate_flicker(
         kernels=run.kernels,
         stage=stage,
         kind="evaluation",
-        inputs=evaluation_inputs(this, fitted, view_time=True),
+        inputs=this.inputs(fitted, paints=True),
         config=_settings(run, config)
         | {
             "shifts": [asdict(shift) for shift in shifts],
@@ -156,39 +106,67 @@ def evaluate_flicker(
     )
 
 
-class _Asked(NamedTuple):
-    """What is judged: a fitted scene of a run, as it is or painted at view time."""
+class _Judge(NamedTuple):
+    """How a scene is judged."""
 
-    run: RunSpec
-    stage: str
-    fitted: FittedRef
-    config: EvaluationConfig
-    view_time: bool
+    build: Callable[..., dict[str, Any]]
+    """Is given what the scene shows as `shown`."""
+    kind: str = "evaluation"
+    settings: Mapping[str, Any] = {}
+    """What decides beside the settings of every evaluation."""
+    weights: Mapping[str, Path] = {}
+    """Files that distances read."""
 
 
-def _judged(
-    asked: _Asked,
-    build: Callable[..., dict[str, Any]],
-    *,
-    kind: str = "evaluation",
-    more: Mapping[str, Any] | None = None,
-    weights: Mapping[str, Path] | None = None,
-) -> StageResult:
-    """Judge what a scene shows, which `build` is given as `shown`.
-
-    `more` are settings beside those of every evaluation, `weights` files that distances read.
-    """
-    run, stage, fitted, config, view_time = asked
-    this = opened(run)
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind=kind,
-        inputs=evaluation_inputs(this, fitted, view_time=view_time) | file_digests(weights or {}),
-        config=_settings(run, config) | dict(more or {}),
-        build=partial(build, shown=shown_by(this, fitted, config, view_time=view_time)),
+def _by_paper(this: OpenedRun, config: EvaluationConfig) -> _Judge:
+    """By views that its fit never saw, and by views beside the path."""
+    evaluation = SceneEvaluation(held_out=this.held_out(config.observation), config=config)
+    return _Judge(
+        partial(_build, evaluation=evaluation),
+        settings={"scoring": asdict(config.scoring)},
+        weights=config.weight_files,
     )
+
+
+def _by_neurad(this: OpenedRun, config: EvaluationConfig) -> _Judge:
+    """By every held-out image, as neurad-studio does."""
+    split = this.spec.split.spec
+    if split != SPLIT:
+        raise ConfigError(
+            f"--protocol {NEURAD} judges runs that were fitted with --split {SPLIT}, this one was "
+            f"with --split {split}"
+        )
+    held_out = this.held_out(config.observation)
+    build = partial(_build_neurad, held_out=held_out, config=config)
+    return _Judge(build, weights=config.weight_files)
+
+
+def _by_markings(this: OpenedRun, config: EvaluationConfig) -> _Judge:
+    """By the painted lines that it shows on its path and beside it."""
+    held_out, shifts = this.held_out(config.observation), config.scoring.shifts
+    build = partial(_build_markings, held_out=held_out, shifts=shifts)
+    return _Judge(build, settings={"shifts": [asdict(shift) for shift in shifts]})
+
+
+def _by_strips(this: OpenedRun, config: EvaluationConfig) -> _Judge:
+    """By held-out frames of every camera that the fit did not see."""
+    evaluation = StripEvaluation(held_out=this.held_out(config.observation), views=this.views)
+    if not evaluation.cameras:
+        raise ConfigError(
+            f"the fit saw every camera of {this.spec.split.scene_id}; "
+            "leave one out with --train-cameras"
+        )
+    return _Judge(partial(_build_strips, evaluation=evaluation), kind="strips")
+
+
+JUDGES: Mapping[str, Callable[[OpenedRun, EvaluationConfig], _Judge]] = {
+    PAPER: _by_paper,
+    TRUTH: _by_paper,
+    NEURAD: _by_neurad,
+    CROSS_CAMERA: _by_strips,
+    MARKINGS: _by_markings,
+}
+"""By protocol."""
 
 
 def _settings(run: RunSpec, config: EvaluationConfig) -> dict[str, Any]:
@@ -197,16 +175,6 @@ def _settings(run: RunSpec, config: EvaluationConfig) -> dict[str, Any]:
         "observation": asdict(config.observation),
         "conditions": asdict(config.conditions),
     }
-
-
-def evaluation_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dict[str, str]:
-    """Digests of what every evaluation of a fitted scene depends on."""
-    inputs = {
-        "scene": this.scene.content_digest,
-        "observations": fitted.observations.digest,
-        "gaussians": fitted.gaussians.digest,
-    }
-    return inputs | ({"painter": this.painter.digest} if view_time else {})
 
 
 def load_scores(store: Store, ref: ArtefactRef) -> Scores:

@@ -89,12 +89,7 @@ def paint(
         kernels=run.kernels,
         stage=stage,
         kind="guidance",
-        inputs={
-            "scene": this.scene.content_digest,
-            "observations": fitted.observations.digest,
-            "gaussians": fitted.gaussians.digest,
-            "painter": this.painter.digest,
-        },
+        inputs=this.inputs(fitted, paints=True),
         config={"novel": asdict(novel), "conditions": asdict(conditions), "start": start_frame},
         build=partial(
             _build,

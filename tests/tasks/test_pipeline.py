@@ -28,7 +28,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.storage.tensor_files import read_tensors
-from tasks.evaluation.views import evaluate, evaluate_by_neurad, evaluate_flicker, load_scores
+from tasks.evaluation.views import evaluate, evaluate_flicker, load_scores
 from tasks.opened import open_scene
 from tasks.painter.evaluate import score_painters
 from tasks.painter.held_out_fits import HeldOutFit
@@ -74,14 +74,7 @@ def test_an_artefact_is_explained_back_to_its_scene(run, store, capsys, monkeypa
 def test_a_run_of_another_split_is_not_judged_as_neurad_studio_does(parameters, store, final):
     run = parameters.run_spec(store.root)
     with pytest.raises(ConfigError, match="with --split linspace, this one was with --split alter"):
-        evaluate_by_neurad.fn(run, "neurad", final, parameters.evaluation_config)
-
-
-def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
-    run = parameters.run_spec(store.root)
-    again = fit.fn(run, "fit", stages["prepare"].ref, parameters.fit)
-    assert not again.is_new
-    assert again.ref == stages["fit"].ref
+        evaluate.fn(run, "neurad", final, parameters.evaluation_config, protocol="neurad")
 
 
 def test_a_fit_keeps_its_course_and_no_scratch(store, stages):
