@@ -11,8 +11,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.formats import ExportFormat, export_format
 from lidarpainter_models.export.simulated_sweeps import SweepRequest
 from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
-from tasks.exports.dataset import export_dataset
-from tasks.exports.log import export_log
+from tasks.exports.dataset import export_dataset, export_log
 from tasks.exports.scene import SceneRequest, export_images, export_scene, export_video
 from tasks.exports.simulator import export_bundle
 from tasks.exports.sweeps import export_sweeps

@@ -15,9 +15,9 @@ from lidarpainter_models.lidar.firings import mounted_lidar
 from lidarpainter_models.lidar.sensors import PRESETS, LidarSensor
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.evaluation.views import load_scores
+from tasks.exports.sweeps import render_sweeps
 from tasks.lidar.channel import learn_lidar, lidar_of
 from tasks.lidar.evaluate import evaluate_lidar
-from tasks.lidar.render import render_sweeps
 from tasks.opened import open_scene
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, lineage, open_run
@@ -38,24 +38,18 @@ def learnt_channel(
     return learn_lidar.fn(run, first.final, LidarConfig(), lidar_name).ref
 
 
-def render_lidar_run(store: Store, run: str, request: SweepRequest, out: Path) -> dict[str, Any]:
+def sweeps_of_run(
+    store: Store, finished: FinishedRun, request: SweepRequest, out: Path
+) -> dict[str, Any]:
     """Write the sweeps that a LiDAR would take in a finished run, into a new folder.
 
     Returns:
         What `render --lidar --json` prints.
 
     Raises:
-        UnknownRecordError: there is no such run, or it did not complete.
         ConfigError: the trajectory leads too far, or something is there already.
         SceneError: the scene has no LiDAR to learn from, or no sweep is left.
     """
-    return sweeps_of_run(store, open_run(store, run), request, out)
-
-
-def sweeps_of_run(
-    store: Store, finished: FinishedRun, request: SweepRequest, out: Path
-) -> dict[str, Any]:
-    """The same of a run that is open."""
     spec = view_parameters(finished).run_spec(store.address)
     channel = learnt_channel(store, finished, request.lidar_name)
     made = render_sweeps(spec, finished.final, channel, request, out)
@@ -67,7 +61,7 @@ def sweeps_of_run(
     }
 
 
-def evaluate_lidar_run(store: Store, run: str, *, lidar_name: str | None = None) -> dict[str, Any]:
+def evaluate_lidar_run(store: Store, run: str) -> dict[str, Any]:
     """Judge the simulated sweeps of a finished run, and enter every number into the catalog.
 
     Returns:
@@ -79,8 +73,7 @@ def evaluate_lidar_run(store: Store, run: str, *, lidar_name: str | None = None)
     """
     finished = open_run(store, run)
     spec = view_parameters(finished).run_spec(store.address)
-    channel = learnt_channel(store, finished, lidar_name)
-    made = evaluate_lidar.fn(spec, finished.final, channel, lidar_name)
+    made = evaluate_lidar.fn(spec, finished.final, learnt_channel(store, finished))
     found = load_scores(store, made.ref)
     record_scores(store, finished.run_id, finished.scene_id, {LIDAR: found})
     return {

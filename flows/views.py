@@ -11,7 +11,6 @@ from flows.parameters import view_parameters
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.evaluation.score_tables import ENVELOPE
-from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import RECORDING, UNPAINTED, ViewRequest
 from lidarpainter_models.observations.image_shrinking import require_recorded_width
@@ -19,8 +18,7 @@ from tasks.opened import open_scene
 from tasks.runs import FinishedRun, is_of_its_scene, lineage, open_run
 from tasks.specs import FittedRef
 from tasks.views.drive import SHOWN, view_live
-from tasks.views.render import ViewedRun, render
-from tasks.views.stylize import stylize
+from tasks.views.render import ViewedRun, render, stylize
 
 BEFORE_PAINTING = "before painting"
 """What the viewer calls the scene of a run after its first fit."""
@@ -87,14 +85,9 @@ def viewed_run(store: Store, finished: FinishedRun, request: ViewRequest) -> Vie
         fitted=finished.final,
         observation=parameters.observation,
         conditions=parameters.conditions,
-        calibration=_calibration(store, finished),
+        calibration=calibration_of(envelope_of(store, finished)),
         beside=_beside(store, finished, request.beside),
     )
-
-
-def _calibration(store: Store, finished: FinishedRun) -> Calibration:
-    """As the envelope of the run says, or of the nearest one that it was changed from."""
-    return calibration_of(envelope_of(store, finished))
 
 
 def envelope_of(store: Store, finished: FinishedRun) -> dict[str, Any] | None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, print_result
+from flows.cli.output import print_result
 from flows.cli.shared_options import (
     AsJson,
     TrajectorySpec,
@@ -121,10 +121,8 @@ def _render_images(run: str, request: "ViewRequest", out: Path, *, as_json: bool
 
     with shown_progress():
         result = render_run(existing_store(), run, request, out.absolute())
-    if as_json:
-        print_json(result)
-    else:
-        print_pairs(f"images of {result['scene']}", in_words(result))
+    shown = result if as_json else in_words(result)
+    print_result(f"images of {result['scene']}", shown, as_json=as_json)
 
 
 def _refuse_of_images(given: Sequence[object], flags: Sequence[bool]) -> None:
@@ -161,8 +159,10 @@ def _render_lidar(
     )
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.lidar import render_lidar_run
+    from flows.lidar import sweeps_of_run
+    from tasks.runs import open_run
 
+    store = existing_store()
     with shown_progress():
-        result = render_lidar_run(existing_store(), run, request, out.absolute())
+        result = sweeps_of_run(store, open_run(store, run), request, out.absolute())
     print_result(f"sweeps of {result['scene']}", result, as_json=as_json)

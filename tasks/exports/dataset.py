@@ -1,4 +1,4 @@
-"""Write a drive as a data set that others reconstruct from: recorded images, and views beside."""
+"""Write a drive as a data set: its recorded log, or images and views beside to reconstruct from."""
 
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,32 @@ from lidarpainter_models.export.view_files import recorded_image
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.trajectory_words import RECORDED
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.storage.whole_files import write_whole
-from tasks.exports.places import new_folder
+from tasks.exports.places import STAGE, new_folder
 from tasks.opened import opened
-from tasks.progress import listener
+from tasks.progress import listener, progress_of
 from tasks.stored import load_observations
 from tasks.views.render import ViewedRun, followed_paths
 
-STAGE = "export"
+
+def export_log(
+    scene: DrivingScene, row: ExportFormat, frames: slice | None, out: Path
+) -> dict[str, Any]:
+    """Write frames of a recorded scene into a new folder; all of them if None.
+
+    Raises:
+        SceneError: no frame is left, or the format has no place for something in the scene.
+        MissingPackageError: the format's extra is not installed.
+        ConfigError: something is there already.
+        WriteError: the disk refuses; nothing is left half-written.
+    """
+    wanted = frozenset(scene.frame_indices[frames or slice(None)])
+    listener().started(STAGE)
+    with new_folder(out) as folder:
+        made = row.load_writer()(folder, scene, wanted, progress_of(STAGE))
+    num_bytes = sum(file.stat().st_size for file in out.iterdir())
+    return {"path": str(out), "num_bytes": num_bytes, **made}
 
 
 def export_dataset(

@@ -8,6 +8,9 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.storage.whole_files import storage_errors
 from lidarpainter_models.storage.whole_folders import AsideFolder
 
+STAGE = "export"
+"""What listeners are told of every export."""
+
 
 @contextmanager
 def new_folder(out: Path, *, replaces: Collection[str] = ()) -> Iterator[Path]:

@@ -12,7 +12,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.ply_files import write_ply
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import SceneObservations
-from tasks.exports.places import new_folder
+from tasks.exports.places import STAGE, new_folder
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
@@ -66,7 +66,6 @@ def _of_export(made: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-STAGE = "export"
 _NUM_COMPARED = 3
 """Cameras by which a loss is measured: at the beginning, the middle and the end of the drive."""
 

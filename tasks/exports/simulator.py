@@ -15,13 +15,13 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.lidar.surroundings import Surroundings, surroundings_of
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.storage.whole_files import whole_file
+from tasks.exports.places import STAGE
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.runs import FinishedRun
 from tasks.specs import FittedRef, RunSpec
 from tasks.stored import load_observations, load_scene
 
-STAGE = "export"
 Envelope = Mapping[str, Any] | None
 
 

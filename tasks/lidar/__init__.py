@@ -1,1 +1,1 @@
-"""What a LiDAR would measure in a finished run: learn it, judge it, write sweeps."""
+"""What a LiDAR would measure in a finished run: learn it, judge it."""

@@ -23,16 +23,14 @@ STAGE = "evaluate-lidar"
 
 
 @stage_task
-def evaluate_lidar(
-    run: RunSpec, fitted: FittedRef, channel: ArtefactRef, lidar_name: str | None = None
-) -> StageResult:
-    """Score the sweeps of held-out frames.
+def evaluate_lidar(run: RunSpec, fitted: FittedRef, channel: ArtefactRef) -> StageResult:
+    """Score the sweeps of held-out frames, those of the log's first LiDAR.
 
     Raises:
         ConfigError: no sweep was held out.
     """
     this = opened(run)
-    name = lidar_of(this.scene, lidar_name)
+    name = lidar_of(this.scene, None)
     return run_stage(
         this.store,
         kernels=run.kernels,
@@ -66,6 +64,6 @@ def _build(
     place: Workplace, progress: Progress, *, judged: Callable[[], _Judged]
 ) -> dict[str, Any]:
     evaluation, channel, scene = judged()
-    scores = evaluation.scores(channel, scene, lambda done, total: progress(done, total, ""))
+    scores = evaluation.scores(channel, scene, progress)
     write_json(place.output / SCORES_FILE, {LIDAR: scores})
     return {"num_sweeps": scores["num_sweeps"]}

@@ -1,4 +1,4 @@
-"""Render a finished run along a trajectory, painted at view time if asked for."""
+"""Show a finished run along a trajectory: as it is, painted at view time, or in another weather."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -11,8 +11,9 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.anchoring import calibration_of
 from lidarpainter_models.evaluation.view_confidence import PROMISED, Calibration
 from lidarpainter_models.export import view_requests
+from lidarpainter_models.export.styled_views import StyleRequest, write_styled
 from lidarpainter_models.export.view_files import Delivery, legend, write_views
-from lidarpainter_models.export.view_requests import ViewRequest
+from lidarpainter_models.export.view_requests import ViewRequest, only_path
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.observations.settings import ObservationConfig
 from tasks.evaluation.shown import condition_builder
@@ -22,7 +23,7 @@ from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
 from tasks.stored import load_observations, load_scene
 
-STAGE = "render"
+STAGE, STYLIZE = "render", "stylize"
 POSES_FILE, LEGEND_FILE, VIDEO_FILE = "trajectory.json", "semantics.json", "video.mp4"
 
 
@@ -141,3 +142,27 @@ def write_paths(
         "collisions": [found for met in collisions for found in met],
         **({"fps": fps} if kinds.video else {}),
     }
+
+
+def stylize(
+    viewed: ViewedRun, request: ViewRequest, style: StyleRequest, out: Path
+) -> dict[str, Any]:
+    """Write a styled image for every recorded moment, the clear one beside it.
+
+    Returns:
+        Where the images are and how well their edges are those of the clear ones.
+
+    Raises:
+        SceneError: the scene has no such camera, or no frame is left.
+        ConfigError: several cameras are asked for, or what cannot be put in a style.
+    """
+    style.check(request)
+    path = only_path(followed_paths(viewed, request), request)
+    listener().started(STYLIZE)
+    total = len(path.views)
+    rows, kept = write_styled(
+        path, style, out, lambda done: listener().advanced(STYLIZE, done, total, "")
+    )
+    described = {"trajectory": request.trajectory.spec, "prompt": style.mix.text}
+    write_json(out / POSES_FILE, {**described, "seed": style.seed, "images": rows})
+    return {"folder": str(out), "num_images": total, "camera": path.camera_name, **kept}

@@ -13,8 +13,7 @@ from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.weather.mix import StyleMix
-from tasks.views.render import render
-from tasks.views.stylize import stylize
+from tasks.views.render import render, stylize
 
 
 @pytest.mark.parametrize("is_painted", [False, True])
