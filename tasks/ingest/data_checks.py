@@ -4,7 +4,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ from tasks.opened import open_scene
 LookingAt = Callable[[str], None]
 """Told the name of what is looked at next."""
 Bodies = Callable[[], dict[str, Bool[np.ndarray, "height width"]]]
+"""What of each camera's images is the recording car, found when it is first asked for."""
 CAMERA_FAULTS = "camera faults"
 CORRECTS = "--set observation.corrects_cameras=true"
 TRIAL_FRAMES = slice(0, 6)
@@ -49,12 +50,8 @@ def check_stored_scene(
 ) -> list[Finding]:
     """Check a scene of the store; writes an overlay image and all findings as JSON.
 
-    Args:
-        store: where the scene is.
-        scene_id: its dataset and sequence, with a slash between.
-        out: a file or folder for the overlay image, by default the store's folder `doctor`; the
-            JSON lies beside it under the same name.
-        looking_at: told what is looked at next.
+    `out` is a file or folder for the image, by default the store's folder `doctor`; the JSON lies
+    beside it under the same name.
     """
     scene = open_scene(store, scene_id)
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
@@ -69,7 +66,7 @@ def findings_about(
     looking_at: LookingAt = lambda _name: None,
 ) -> list[Finding]:
     """Everything that is looked for in a whole scene; a trial of a few frames says too little."""
-    bodies = _bodies_of(scene)
+    bodies = cache(partial(own_bodies, scene, scene.views))
     looks: dict[str, Callable[[], list[Finding]]] = {
         "scene": lambda: _findings(scene, bodies, looking_at),
         CAMERA_FAULTS: lambda: _camera_faults(scene, bodies),
@@ -87,11 +84,6 @@ def findings_about(
     return found
 
 
-def _bodies_of(scene: DrivingScene) -> Bodies:
-    """What of each camera's images is the recording car, found when it is first asked for."""
-    return cache(lambda: own_bodies(scene, scene.views))
-
-
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
     """Check the first frames of every sequence of a dataset, read into a folder then removed.
 
@@ -105,7 +97,8 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
                     path = ingest_scene(dataset, folder, sequence, Path(trial), frames=TRIAL_FRAMES)
                 image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
                 scene = DrivingScene.open(path)
-                found = _examined(scene, image, _findings(scene, _bodies_of(scene)))
+                bodies = cache(partial(own_bodies, scene, scene.views))
+                found = _examined(scene, image, _findings(scene, bodies))
             except (LidarPainterError, CatalogError) as error:
                 found = [Finding("reading", "fail", str(error))]
         findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]

@@ -17,7 +17,7 @@ from lidarpainter_models.synthetic.street import WORLD_VERSION
 from tasks.ingest.bucket_roots import root_at_hand
 from tasks.measuring import measured
 from tasks.opened import open_scene
-from tasks.progress import listener
+from tasks.progress import listener, progress_of
 from tasks.specs import street_id
 from tasks.stages import stage_task
 
@@ -43,11 +43,7 @@ def ingest_sequence(
         writing(store, scene_id_of(dataset, folder, sequence)),
     ):
         log = open_log(dataset, folder, sequence, frames=frames, cameras=cameras, rig=rig)
-        path = write_log(
-            log,
-            store.root,
-            progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
-        )
+        path = write_log(log, store.root, progress=progress_of(STAGE))
     return record_scene(store, path)
 
 
@@ -57,11 +53,7 @@ def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, 
     store = open_store(store_path)
     store.make()
     with writing(store, street_id(config.seed)):
-        path = write_street(
-            config,
-            store.root,
-            progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
-        )
+        path = write_street(config, store.root, progress=progress_of(STAGE))
     return record_scene(store, path)
 
 

@@ -16,7 +16,7 @@ from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 from tasks.ingest.ingest import STAGE as WRITE
 from tasks.ingest.ingest import record_scene, writing
 from tasks.opened import open_scene
-from tasks.progress import Progress, listener
+from tasks.progress import Progress, progress_of
 from tasks.stages import StageResult, run_stage, stage_task
 
 STAGE = "localise"
@@ -50,13 +50,9 @@ def localise(store_path: Path, scene_id: str) -> StageResult:
 def ingest_localised(
     store_path: Path, scene_id: str, found: StageResult, sequence: str | None
 ) -> dict[str, Any]:
-    """Write a scene with the poses that were found; returns its row in `scenes`.
+    """Write a scene with the poses that `localise` found; returns its row in `scenes`.
 
-    Args:
-        store_path: where both scenes are.
-        scene_id: whose poses were found.
-        found: what `localise` gave.
-        sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
+    The new scene is called `sequence` in its dataset; as the old one with a suffix if None.
 
     Raises:
         ConfigError: a scene of that name is there that was made otherwise.
@@ -70,7 +66,7 @@ def ingest_localised(
         path = write_localised(
             *(scene, _load(store, found), store.root, name),
             provenance={STAGE: told},
-            progress=lambda done, total: listener().advanced(WRITE, done, total, ""),
+            progress=progress_of(WRITE),
         )
     return record_scene(store, path)
 
@@ -94,7 +90,7 @@ def require_free(store: Store, scene: DrivingScene, name: str, made_by: str) -> 
 
 
 def _build(place: Workplace, progress: Progress, *, scene: DrivingScene) -> dict[str, Any]:
-    path = drive_of(scene, lambda done, total: progress(done, total, ""))
+    path = drive_of(scene, progress)
     tensors = {"timestamps_ns": path.timestamps_ns, "world_from_ego": path.world_from_body}
     write_tensors(place.output / FILE, tensors, {})
     difference = path_difference(path, driven_road(scene)) if scene.has_poses else None

@@ -1,5 +1,6 @@
 """Bring a recording with a fault into the store and the catalog."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from lidarpainter_models.stress.spoiling import (
 )
 from tasks.ingest.ingest import STAGE, record_scene, writing
 from tasks.opened import open_posed, open_scene
-from tasks.progress import listener
+from tasks.progress import progress_of
 from tasks.stages import stage_task
 
 
@@ -27,13 +28,8 @@ def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> 
     name = spoilt_id(scene, cause, level)
     if not _is_stored(store, name, spoilt_from(scene, cause, level)):
         with writing(store, name):
-            path = write_spoilt(
-                scene,
-                cause,
-                level,
-                store.root,
-                progress=lambda done, total: listener().advanced(STAGE, done, total, name),
-            )
+            told = partial(progress_of(STAGE), note=name)
+            path = write_spoilt(scene, cause, level, store.root, progress=told)
         record_scene(store, path)
     return name
 

@@ -99,7 +99,7 @@ def _build(
         mounted(this, scene, name),
         this.views.train_frames,
         config,
-        progress=lambda done, total: progress(done, total, ""),
+        progress=progress,
     )
     write_tensors(place.output / CHANNEL_FILE, *channel.to_arrays())
     return {"lidar": name, "num_surfels": len(channel.surfels)}

@@ -19,7 +19,7 @@ from lidarpainter_models.storage.whole_files import write_whole
 from tasks.evaluation.shown import view_time_painting
 from tasks.lidar.channel import lidar_of, load_channel, mounted
 from tasks.opened import OpenedRun, opened
-from tasks.progress import listener
+from tasks.progress import listener, progress_of
 from tasks.specs import FittedRef
 from tasks.stored import load_scene
 from tasks.views.render import ViewedRun, followed_paths
@@ -63,9 +63,7 @@ def write_page(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, 
     if not aside.is_recorded:
         legs.append(Leg(title=f"{name}, {aside.spec}", trajectory=aside))
     listener().started(STAGE)
-    page = recorded_page(
-        drive, legs, notes, progress=lambda done, total: listener().advanced(STAGE, done, total, "")
-    )
+    page = recorded_page(drive, legs, notes, progress=progress_of(STAGE))
     write_whole(out, page.encode("utf-8"))
     return {"path": str(out), "bytes": len(page), "num_moments": len(drive.path.views)}
 
@@ -82,14 +80,9 @@ def view_live(
 ) -> None:
     """Show a drive in a browser until stopped; tells its address when it is there.
 
-    Args:
-        viewed: the run whose path is followed, and whose scene painters are shown.
-        request: the camera and the frames that are followed.
-        scenes: fitted scenes by the names that people choose from; the first is shown first.
-        lidar: what the log's first LiDAR was learnt to see; None shows no simulated sweeps.
-        port: where to listen; None takes a free one.
-        opened_at: told the address.
-        stopped: ends the viewer when it is set.
+    People choose from the fitted `scenes` by name, of which the first is shown first; painters are
+    shown that of `viewed`. `lidar` is what the log's first LiDAR was learnt to see; without it
+    there are no simulated sweeps. No port takes a free one.
 
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
