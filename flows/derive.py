@@ -4,22 +4,8 @@ Nothing is changed in place: the source run stays as it is, and the new run name
 (`derived_from`) and what was changed (`change`) in the catalog. It can be rendered, judged,
 explained, deleted and changed again like any other; it stays whole where its source is deleted.
 
-A style, say, is one module-level function and one call:
-
-    def _build(place, progress, *, scene, style):
-        changed = styled_scene(scene(), style)  # a new scene: what is loaded is shared
-        save_scene(place.output, changed, [])
-        return describe(changed)
-
-    source = open_run(store, "latest")
-    result = derive_run(
-        store,
-        source,
-        Change(kind="style", parameters=style, inputs={"painter": painter.digest}),
-        build=partial(
-            _build, scene=partial(load_scene, store, source.final.gaussians), style=style
-        ),
-    )
+A change is one module-level function that builds, such as `put_style`, and one call of
+`derive_run`, such as that of `style_run`. A build makes a new scene: what is loaded is shared.
 """
 
 import time

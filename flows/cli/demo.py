@@ -4,15 +4,12 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from flows.cli.output import print_json, say_status
 from flows.cli.shared_options import AsJson, Painter, Settings, check_painter, described
-
-if TYPE_CHECKING:
-    pass
 
 FIRST_IMAGE_NAME = "street.png"
 REPORT_NAME = "report.html"

@@ -95,8 +95,7 @@ def status(
     """
     from flows.fleet.status import fleet_status
 
-    ledger = _ledger()
-    name = fleet or ledger.latest()
+    ledger, name = _named(fleet)
     if metrics is not None:
         from flows.fleet.metrics_file import write_metrics
 
@@ -119,8 +118,7 @@ def retry(
 
     Example: lidarpainter fleet retry --scene pandaset/002
     """
-    ledger = _ledger()
-    name = fleet or ledger.latest()
+    ledger, name = _named(fleet)
     _show_scenes(name, "waiting", ledger.retry(name, scene or ()), as_json=as_json)
 
 
@@ -133,8 +131,7 @@ def cancel(fleet: Annotated[str | None, typer.Argument()] = None, as_json: AsJso
 
     Example: lidarpainter fleet cancel
     """
-    ledger = _ledger()
-    name = fleet or ledger.latest()
+    ledger, name = _named(fleet)
     _show_scenes(name, "cancelled", ledger.cancel(name), as_json=as_json)
 
 
@@ -145,7 +142,7 @@ def work(fleet: str) -> None:
 
     Example: lidarpainter fleet work night-of-monday
     """
-    ledger = _ledger()
+    ledger, _ = _named(fleet)
     ledger.rows(fleet)
     from flows.fleet.work import make_sequence
     from flows.fleet.worker import EventLog, Worker
@@ -169,8 +166,7 @@ def report(
 
     Example: lidarpainter fleet report night-of-monday --out night.html
     """
-    ledger = _ledger()
-    name = fleet or ledger.latest()
+    ledger, name = _named(fleet)
     ledger.rows(name)
     say_status(f"writing about {name}")
     from flows.fleet.report import fleet_page
@@ -232,11 +228,13 @@ def _closed(ledger: "FleetLedger") -> list[str]:
         return [str(error)]
 
 
-def _ledger() -> "FleetLedger":
+def _named(fleet: str | None) -> "tuple[FleetLedger, str]":
+    """The ledger, and the fleet that is meant: the one asked for last if none is named."""
     from catalog.fleets import FleetLedger
     from catalog.store import existing_store
 
-    return FleetLedger(existing_store())
+    ledger = FleetLedger(existing_store())
+    return ledger, fleet or ledger.latest()
 
 
 def _show(status: dict[str, Any], *, as_json: bool) -> None:

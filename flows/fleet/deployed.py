@@ -35,7 +35,6 @@ from lidarpainter_models.errors import ConfigError
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient
     from prefect.client.schemas.actions import DeploymentScheduleCreate
-    from prefect.client.schemas.objects import FlowRun
 
 POOL = "lidarpainter"
 OPEN = ("SCHEDULED", "PENDING", "RUNNING")
@@ -99,7 +98,7 @@ def _start_workers(ledger: FleetLedger, name: str, wanted: int) -> None:
     """Ask for the workers that are neither at work nor on their way."""
     from prefect.client.orchestration import get_client
 
-    there = [run for run in _runs(ledger, name, OPEN) if "fleet" in run.parameters]
+    there = [run for run in open_runs(ledger, OPEN, fleet_tag(name)) if "fleet" in run.parameters]
     with get_client(sync_client=True) as client:
         deployment = client.read_deployment_by_name(f"{WORK}/{name}")
         for _ in range(wanted - len(there)):
@@ -113,14 +112,10 @@ def _drop_late_firings(ledger: FleetLedger, name: str) -> None:
 
     now = datetime.now(UTC)
     with get_client(sync_client=True) as client:
-        for run in _runs(ledger, name, ("SCHEDULED",)):
+        for run in open_runs(ledger, ("SCHEDULED",), fleet_tag(name)):
             due = run.next_scheduled_start_time
             if "manifest" in run.parameters and due is not None and due < now:
                 client.set_flow_run_state(run.id, Cancelled(message="another firing came first"))
-
-
-def _runs(ledger: FleetLedger, name: str, types: tuple[str, ...]) -> "list[FlowRun]":
-    return open_runs(ledger, types, fleet_tag(name))
 
 
 def deploy(

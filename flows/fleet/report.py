@@ -11,6 +11,7 @@ import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
+from catalog.points import FINAL
 from catalog.retries import by_cause
 from catalog.tables import Row
 from flows.fleet.manifest import Budget
@@ -27,7 +28,6 @@ MOST_ROWS = 50
 """Rows of a table at most; those beyond are counted."""
 MOST_SCENES = 10
 QUALITY = ("psnr", "ssim", "lpips")
-FINAL_VARIANTS = ("painted", "refined")
 RUNNING_MEDIAN = 9
 """Attempts whose errors are taken together in the chart of the forecast."""
 
@@ -61,7 +61,7 @@ class FleetRecord:
         runs = {row["run_id"] for row in self.rows if row["run_id"]}
         found: dict[str, dict[str, float]] = {}
         for row in self.ledger.store.tables.rows("metrics", where={"run_id": runs}):
-            is_shown = row["protocol"] == "recorded" and row["variant"] in FINAL_VARIANTS
+            is_shown = row["protocol"] == "recorded" and row["variant"] in FINAL
             if is_shown and row["name"] in QUALITY and row["value"] is not None:
                 found.setdefault(row["run_id"], {})[row["name"]] = row["value"]
         return found

@@ -1,6 +1,6 @@
 """Speed against accuracy: every configuration a point, drawn, and said in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,9 @@ def chart_of(points: Sequence[Point], out: Path) -> dict[str, Any]:
         What `chart --json` prints: `points`, `pictures`, and what they say.
     """
     groups = groups_of(points)
-    drawn = [name for name in DRAWN if any(name in group.figures for group in groups)]
-    chart = _chart("Speed against accuracy", groups, named=(DEFAULT,))
-    page = write_chart_page(chart, COSTS, _known(groups), out / "chart.html")
+    drawn = _known(groups, DRAWN)
+    chart = _chart("Speed against accuracy", groups, named=DEFAULT)
+    page = write_chart_page(chart, COSTS, _known(groups, QUALITIES), out / "chart.html")
     pictures = [*draw_chart(chart, TIME, drawn, out / "chart"), page]
     return {
         "points": rows_of(points),
@@ -44,8 +44,8 @@ def sizes_of(points: Sequence[Point], factors: Sequence[Factor], out: Path) -> d
     for factor in factors:
         names = [level.name for level in factor.levels]
         groups = groups_of([point for point in points if point.configuration in names])
-        drawn = [name for name in DRAWN if any(name in group.figures for group in groups)]
-        chart = _chart(f"Quality against {factor.name}", groups, named=(factor.default,))
+        drawn = _known(groups, DRAWN)
+        chart = _chart(f"Quality against {factor.name}", groups, named=factor.default)
         pictures += draw_chart(chart, factor.cost, drawn, out / f"size-{factor.name}")
         says += [one for name in drawn for one in _returns(groups, factor, name)]
     return {"points": rows_of(points), "pictures": list(map(str, pictures)), "says": says}
@@ -67,18 +67,18 @@ def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
     ]
 
 
-def _chart(title: str, groups: Sequence[Group], named: Sequence[str]) -> Chart:
+def _chart(title: str, groups: Sequence[Group], named: str) -> Chart:
     panels: dict[str, list[Mark]] = {}
     for group in groups:
         name = group.configuration
-        mark = Mark(name=name, is_named=name in named, figures=group.figures)
+        mark = Mark(name=name, is_named=name == named, figures=group.figures)
         panels.setdefault(group.scene, []).append(mark)
     return Chart(title=title, panels=panels, labels=LABELS)
 
 
-def _known(groups: Sequence[Group]) -> list[str]:
-    """The qualities that somebody has."""
-    return [name for name in QUALITIES if any(name in group.figures for group in groups)]
+def _known(groups: Sequence[Group], names: Iterable[str]) -> list[str]:
+    """Those of some qualities that somebody has."""
+    return [name for name in names if any(name in group.figures for group in groups)]
 
 
 def _by_scene(groups: Sequence[Group], quality: str) -> Mapping[str, list[Group]]:
