@@ -10,7 +10,6 @@ optical: x right, y down, z forward (REP 103).
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -305,27 +304,7 @@ def _ros_decoder(schema: "Schema") -> Callable[[bytes], Any]:
 
 def _protobuf_decoder(schema: "Schema") -> Callable[[bytes], Any]:
     """A parser of a message whose schema is a FileDescriptorSet."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf import descriptor_pb2, message_factory
 
-    pool = descriptor_pool.DescriptorPool()
-    files = {
-        file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
-    }
-    added: set[str] = set()
-
-    def add(name: str, depth: int = 0) -> None:
-        if name in added or name not in files or depth > len(files):
-            return
-        added.add(name)
-        for needed in files[name].dependency:
-            add(needed, depth + 1)
-        pool.Add(files[name])
-
-    for name in files:
-        add(name)
-    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
-    return partial(_parsed, kind)
-
-
-def _parsed(kind: Any, data: bytes) -> Any:  # noqa: ANN401
-    return kind.FromString(data)
+    files = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
+    return message_factory.GetMessages(files)[schema.name].FromString

@@ -13,8 +13,8 @@ safer in memory:
 
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import DecodeError, Message
+from google.protobuf import descriptor_pb2, message_factory
+from google.protobuf.message import DecodeError
 
 from lidarpainter_models.errors import DataError
 
@@ -113,7 +113,7 @@ def parse_message(name: str, content: bytes, where: str) -> Any:  # noqa: ANN401
     Raises:
         DataError: the bytes are cut off, nest too deeply, or are no such message.
     """
-    message = _CLASSES[name]()
+    message = _CLASSES[f"{_PACKAGE}.{name}"]()
     try:
         message.ParseFromString(content)
     except DecodeError as error:
@@ -138,13 +138,4 @@ def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:
     return file
 
 
-def _message_classes() -> dict[str, type[Message]]:
-    pool = descriptor_pool.DescriptorPool()
-    pool.AddSerializedFile(_file_descriptor().SerializeToString())
-    return {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{_PACKAGE}.{name}"))
-        for name in _FIELDS
-    }
-
-
-_CLASSES = _message_classes()
+_CLASSES = message_factory.GetMessages([_file_descriptor()])
