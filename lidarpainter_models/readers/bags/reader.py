@@ -18,7 +18,6 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.timed_poses import compensated
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
@@ -26,13 +25,12 @@ from lidarpainter_models.readers.bags.chunks import BagMessage, bag_files, bag_m
 from lidarpainter_models.readers.bags.clouds import BagPoints, points_of
 from lidarpainter_models.readers.bags.frame_plan import FramePlan
 from lidarpainter_models.readers.bags.messages import BagLens, lens_of, place_of
-from lidarpainter_models.readers.bags.pictures import jpeg_of_message
+from lidarpainter_models.readers.bags.pictures import BagVideo, jpeg_of_message
 from lidarpainter_models.readers.bags.proposal import proposed_rig
 from lidarpainter_models.readers.bags.rig import RigCamera, RigLidar, RigSensor, read_rig
 from lidarpainter_models.readers.bags.survey import survey_bag
-from lidarpainter_models.readers.bags.video import BagVideo
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame
-from lidarpainter_models.readers.source_logs.swept_boxes import seen_records
+from lidarpainter_models.readers.source_logs.swept_boxes import seen_records, with_counts
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.schema import NO_POSES, POSES
@@ -257,14 +255,11 @@ class BagLog:
         return compensated(points.xyz_m, times_ns, self._world_from_global @ poses, known_ns)
 
     def _boxes(self, frame_index: int, sweeps: list[SourceSweep]) -> list[BoxRecord]:
-        placed = self._plan.boxes.get(frame_index, [])
-        if not placed:
-            return []
         boxes = [
             replace(box, world_from_box=self._world_from_global @ box.world_from_box)
-            for box in placed
+            for box in self._plan.boxes.get(frame_index, [])
         ]
-        if not sweeps:
+        if not (boxes and sweeps):
             return boxes
         xyz_m = torch.cat([sweep.points.xyz_m for sweep in sweeps])
         origin_ns = sweeps[0].timestamp_ns
@@ -278,10 +273,7 @@ class BagLog:
             )
             lidar_m = sweeps[0].world_from_lidar[:3, 3].numpy()
             return seen_records(boxes, xyz_m, offset_ns, origin_ns, lidar_m)
-        poses = torch.stack([box.world_from_box for box in boxes])
-        sizes_m = torch.tensor([box.size_m for box in boxes])
-        counts = count_points_in_boxes(xyz_m, poses, sizes_m).tolist()
-        return [replace(box, num_points=count) for box, count in zip(boxes, counts, strict=True)]
+        return with_counts(boxes, xyz_m)
 
 
 def _around(

@@ -16,7 +16,6 @@ Ego is the frame of the LiDAR, 1.7 m above the road, x forward, y left, z up.
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.timed_poses import compensated, poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid
@@ -35,7 +33,7 @@ from lidarpainter_models.readers.kitti.texts import KittiBox
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_frames
-from lidarpainter_models.readers.source_logs.swept_boxes import with_motion
+from lidarpainter_models.readers.source_logs.swept_boxes import with_counts, with_motion
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.image_bytes import as_jpeg
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
@@ -45,7 +43,6 @@ from lidarpainter_models.scenes.writer import SceneHeader
 DATASET = "kitti"
 LICENCE = "CC BY-NC-SA 3.0 (non-commercial), KITTI by Geiger, Lenz, Stiller and Urtasun"
 LIDAR_NAME = "velodyne"
-_POINT_BYTES = 16
 _HALF_PIXEL = 0.5
 """KITTI counts pixels from the centre of the first one."""
 
@@ -79,13 +76,8 @@ class KittiLog:
         """Everything of one frame, as the writer takes it."""
         time_ns = int(self._drive.sweeps_ns[frame_index])
         sweeps, boxes = self._sweep(frame_index, time_ns), self._boxes.get(frame_index, [])
-        if sweeps and boxes:
-            poses = torch.stack([box.world_from_box for box in boxes])
-            sizes_m = torch.tensor([box.size_m for box in boxes])
-            counts = count_points_in_boxes(sweeps[0].points.xyz_m, poses, sizes_m).tolist()
-            boxes = [
-                replace(box, num_points=count) for box, count in zip(boxes, counts, strict=True)
-            ]
+        if sweeps:
+            boxes = with_counts(boxes, sweeps[0].points.xyz_m)
         return FrameContent(
             frame_index=frame_index,
             place=f"{self.place}, frame {frame_index}",
@@ -113,15 +105,7 @@ class KittiLog:
         path = self.source.root / name
         if not path.exists():
             return []
-        content = self.source.read_bytes(name)
-        if len(content) % _POINT_BYTES:
-            raise DataError(
-                f"{path}: {len(content)} bytes, expected whole points of {_POINT_BYTES}"
-            )
-        scan = np.frombuffer(content, "<f4").reshape(-1, 4)
-        if not np.isfinite(scan).all():
-            number = int(np.flatnonzero(~np.isfinite(scan).all(axis=1))[0])
-            raise DataError(f"{path}, point {number}: holds something other than finite numbers")
+        scan = self.source.read_points(name, 4)
         if not len(scan):
             return []
         seen_ns = self._seen_ns(time_ns, scan[:, :2].astype(np.float64))

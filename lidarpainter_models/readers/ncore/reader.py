@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.timed_poses import compensated
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
@@ -37,7 +36,7 @@ from lidarpainter_models.readers.ncore.sequence import (
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.readers.source_logs.sweep_frames import nearest_images
-from lidarpainter_models.readers.source_logs.swept_boxes import with_motion
+from lidarpainter_models.readers.source_logs.swept_boxes import with_counts, with_motion
 from lidarpainter_models.scenes.frame_content import FrameContent, SourceImage, SourceSweep
 from lidarpainter_models.scenes.image_bytes import as_jpeg
 from lidarpainter_models.scenes.records import (
@@ -121,12 +120,8 @@ class NcoreLog:
         ]
         sweeps = [sweep for sweep in sweeps if sweep.points.num_points]
         boxes = self._boxes.get(frame_index, [])
-        if sweeps and boxes:
-            xyz_m = torch.cat([sweep.points.xyz_m for sweep in sweeps])
-            poses = torch.stack([box.world_from_box for box in boxes])
-            sizes_m = torch.tensor([box.size_m for box in boxes])
-            counts = count_points_in_boxes(xyz_m, poses, sizes_m).tolist()
-            boxes = [replace(box, num_points=n) for box, n in zip(boxes, counts, strict=True)]
+        if sweeps:
+            boxes = with_counts(boxes, torch.cat([sweep.points.xyz_m for sweep in sweeps]))
         return FrameContent(
             frame_index=frame_index,
             place=place,

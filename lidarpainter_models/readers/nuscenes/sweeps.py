@@ -34,7 +34,6 @@ MIN_RANGE_M = 1.0
 MAX_RANGE_M = 1000.0
 """Ten times as far as the sensor can see: a damaged number."""
 _COLUMNS = 5
-_POINT_BYTES = 4 * _COLUMNS
 _MAX_FILE_BYTES = 64 * 1024 * 1024
 """A larger file is no turn of one LiDAR; the real ones have 0.7 MB."""
 _MAX_RING = 1023
@@ -88,17 +87,9 @@ def _turn_share(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 def _read_rows(source: SourceFolder, name: str, path: Path) -> Float[np.ndarray, "points 5"]:
-    content = source.read_bytes(name)
-    if len(content) > _MAX_FILE_BYTES:
+    rows = source.read_points(name, _COLUMNS)
+    if rows.nbytes > _MAX_FILE_BYTES:
         raise DataError(f"{path}: more than {_MAX_FILE_BYTES} bytes, expected one turn of a LiDAR")
-    if len(content) % _POINT_BYTES:
-        raise DataError(
-            f"{path}: {len(content)} bytes, expected whole points of {_POINT_BYTES} bytes"
-        )
-    rows = np.frombuffer(content, "<f4").reshape(-1, _COLUMNS)
-    if not np.isfinite(rows).all():
-        number = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-        raise DataError(f"{path}, point {number}: holds something other than finite numbers")
     ring = rows[:, 4]
     senseless = np.flatnonzero((ring < 0) | (ring > _MAX_RING) | (ring != np.rint(ring)))
     if len(senseless):

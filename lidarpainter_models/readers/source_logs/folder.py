@@ -7,6 +7,9 @@ import stat
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from lidarpainter_models.errors import DataError
 
 MAX_FILE_BYTES = 256 * 1024 * 1024
@@ -36,6 +39,22 @@ class SourceFolder:
             raise DataError(f"{path}: cannot be read ({error.strerror})") from None
         self._digests[name] = hashlib.sha256(content).hexdigest()
         return content
+
+    def read_points(self, name: str, num_columns: int) -> Float[np.ndarray, "points columns"]:
+        """Rows of float32 numbers, little-endian, as LiDAR points are often stored.
+
+        Raises:
+            DataError: the file cannot be read, is cut off, or a number is not finite.
+        """
+        path, content, point_bytes = self.root / name, self.read_bytes(name), 4 * num_columns
+        if len(content) % point_bytes:
+            expected = f"expected whole points of {point_bytes} bytes"
+            raise DataError(f"{path}: {len(content)} bytes, {expected}")
+        rows = np.frombuffer(content, "<f4").reshape(-1, num_columns)
+        if not np.isfinite(rows).all():
+            number = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+            raise DataError(f"{path}, point {number}: holds something other than finite numbers")
+        return rows
 
     def read_json(self, name: str, kind: type) -> Any:  # noqa: ANN401
         """A JSON file whose outermost value is a list or a dict."""

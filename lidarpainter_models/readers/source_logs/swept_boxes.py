@@ -191,17 +191,24 @@ def seen_records(
     xyz_m = xyz_world_m.double().numpy()
     of_one = np.full(len(xyz_m), SPINNING)
     times = SweepTimes(xyz_m, offset_ns / NS_PER_S, of_one, lidar_world_m)
-    poses = torch.stack([box.world_from_box for box in boxes])
-    counts = count_points_in_boxes(
-        xyz_world_m, poses, torch.tensor([box.size_m for box in boxes])
-    ).tolist()
     seen = []
-    for box, count in zip(boxes, counts, strict=True):
+    for box in with_counts(boxes, xyz_world_m):
         upright = _upright(box)
         offset_s = times.time_of(upright, times.inside(upright))
-        time_ns = origin_ns + round(offset_s * NS_PER_S)
-        seen.append(replace(box, timestamp_ns=time_ns, num_points=count))
+        seen.append(replace(box, timestamp_ns=origin_ns + round(offset_s * NS_PER_S)))
     return seen
+
+
+def with_counts(
+    boxes: Sequence[BoxRecord], xyz_world_m: Float[Tensor, "points 3"]
+) -> list[BoxRecord]:
+    """Boxes in the world, each told how many of the points it holds."""
+    if not boxes:
+        return []
+    poses = torch.stack([box.world_from_box for box in boxes])
+    sizes_m = torch.tensor([box.size_m for box in boxes])
+    counts = count_points_in_boxes(xyz_world_m, poses, sizes_m).tolist()
+    return [replace(box, num_points=count) for box, count in zip(boxes, counts, strict=True)]
 
 
 def with_motion(frames: Mapping[int, Sequence[BoxRecord]]) -> dict[int, list[BoxRecord]]:

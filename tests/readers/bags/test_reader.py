@@ -13,6 +13,7 @@ from scene_differences import scene_differences
 from lidarpainter_models.checks.doctor import check_scene
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.readers import ingest_scene, list_sequences, open_log
+from lidarpainter_models.readers.bags.pictures import BagVideo
 from lidarpainter_models.readers.bags.rig import read_rig, rig_of, rig_text
 from lidarpainter_models.readers.source_logs.log import write_log
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -250,8 +251,6 @@ def test_real_log_comes_back_from_a_bag(tmp_path, shared_folder):
 
 
 def test_video_before_its_first_whole_picture_is_left_out(street):
-    from lidarpainter_models.readers.bags.video import BagVideo
-
     packets = [packet for _, packet in h264(street, "stereo_front_left")]
     video = BagVideo("h264", "test")
     shown = [
