@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import interpolate_rigid, invert_rigid
-from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables, Sample
+from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables
 from lidarpainter_models.readers.nuscenes.recordings import LIDAR_NAME, Recording
 from lidarpainter_models.readers.nuscenes.rows import TableRow
 from lidarpainter_models.readers.nuscenes.sweeps import turn_offset_ns
@@ -53,9 +53,7 @@ class AnnotatedBox:
 class Annotations:
     """The boxes of a scene at any of its sweeps."""
 
-    def __init__(
-        self, tables: NuscenesTables, samples: list[Sample], sweeps: list[Recording]
-    ) -> None:
+    def __init__(self, tables: NuscenesTables, samples: list[str], sweeps: list[Recording]) -> None:
         """Read the boxes of all key frames.
 
         Raises:
@@ -66,16 +64,16 @@ class Annotations:
         self._boxes: list[dict[str, AnnotatedBox]] = []
         self._key_ns: list[int] = []
         for sample in samples:
-            if sample.token not in key_sweeps:
+            if sample not in key_sweeps:
                 where = tables["sample"].path
-                raise DataError(f"{where}, token {sample.token}: no key frame of {LIDAR_NAME}")
-            sweep = key_sweeps[sample.token]
+                raise DataError(f"{where}, token {sample}: no key frame of {LIDAR_NAME}")
+            sweep = key_sweeps[sample]
             self._key_ns.append(sweep.timestamp_ns)
             self._boxes.append(_read_boxes(tables, sample, sweep, categories))
         if sorted(set(self._key_ns)) != self._key_ns:
             raise DataError(
                 f"{tables['sample_data'].path}: the key frames of {LIDAR_NAME} are in another "
-                f"order than their samples, the first of which is {samples[0].token}"
+                f"order than their samples, the first of which is {samples[0]}"
             )
         self.moving = _moving(self._boxes)
 
@@ -108,12 +106,12 @@ class _Turn:
 
 
 def _read_boxes(
-    tables: NuscenesTables, sample: Sample, sweep: Recording, categories: dict[str, str]
+    tables: NuscenesTables, sample: str, sweep: Recording, categories: dict[str, str]
 ) -> dict[str, AnnotatedBox]:
     """The boxes of one key frame by instance; `categories` remembers what instances are."""
     turn = _Turn(sweep)
     boxes: dict[str, AnnotatedBox] = {}
-    for row in tables["sample_annotation"].rows_with(sample.token):
+    for row in tables["sample_annotation"].rows_with(sample):
         instance = row.text("instance_token")
         if instance in boxes:
             raise DataError(f"{row.where}: the sample has another box of instance {instance}")

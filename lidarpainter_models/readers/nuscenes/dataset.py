@@ -6,8 +6,8 @@ taken from the first of them in the order above; other versions follow by name.
 """
 
 import stat
-from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
@@ -59,14 +59,6 @@ def _read_table(path: Path, key: str, stamp: tuple[int, ...]) -> NuscenesTable: 
     return NuscenesTable(path, key)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sample:
-    """One key frame."""
-
-    token: str
-    timestamp_ns: int
-
-
 def open_versions(root: Path) -> list[NuscenesTables]:
     """The versions below a root, the fullest first."""
     folders = [file.parent for file in Path(root).glob("v1.0-*/scene.json")]
@@ -101,24 +93,22 @@ def read_global_frame(tables: NuscenesTables, scene: TableRow) -> str:
     return require_name(f"nuscenes-{log.text('location')}", f"{log.where}: location")
 
 
-def read_samples(tables: NuscenesTables, scene: TableRow) -> list[Sample]:
-    """The key frames of a scene by time.
+def read_samples(tables: NuscenesTables, scene: TableRow) -> list[str]:
+    """The tokens of a scene's samples, which are its key frames, by time.
 
     Raises:
         DataError: there are not as many as the scene states, or two have one token or time.
     """
-    rows = tables["sample"].rows_with(scene.text("token"))
+    rows = sorted(tables["sample"].rows_with(scene.text("token")), key=TableRow.timestamp_ns)
     stated = scene.count("nbr_samples")
     if len(rows) != stated or not rows:
         raise DataError(
             f"{scene.where}: states {stated} samples, {tables['sample'].path} has {len(rows)}"
         )
-    samples: list[Sample] = []
-    for row in sorted(rows, key=TableRow.timestamp_ns):
-        sample = Sample(token=row.text("token"), timestamp_ns=row.timestamp_ns())
-        if samples and sample.timestamp_ns == samples[-1].timestamp_ns:
-            raise DataError(f"{row.where}: another sample of the scene has the same time")
-        samples.append(sample)
-    if len({sample.token for sample in samples}) != len(samples):
+    for before, after in pairwise(rows):
+        if before.timestamp_ns() == after.timestamp_ns():
+            raise DataError(f"{after.where}: another sample of the scene has the same time")
+    samples = [row.text("token") for row in rows]
+    if len(set(samples)) != len(samples):
         raise DataError(f"{scene.where}: two samples of the scene have the same token")
     return samples

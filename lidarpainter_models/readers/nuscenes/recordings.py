@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables, Sample
+from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables
 from lidarpainter_models.readers.nuscenes.rows import TableRow
 from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, turn_offset_ns
 
@@ -68,7 +68,7 @@ class RecordedFrame:
 
 
 def read_recordings(
-    tables: NuscenesTables, samples: list[Sample], channels: tuple[str, ...]
+    tables: NuscenesTables, samples: list[str], channels: tuple[str, ...]
 ) -> dict[str, list[Recording]]:
     """Everything that some sensors recorded in a scene, by channel and time.
 
@@ -78,7 +78,7 @@ def read_recordings(
     found: dict[str, list[Recording]] = {channel: [] for channel in channels}
     calibrations: dict[str, Calibration] = {}
     for sample in samples:
-        for row in tables["sample_data"].rows_with(sample.token):
+        for row in tables["sample_data"].rows_with(sample):
             token = row.text("calibrated_sensor_token")
             if token not in calibrations:
                 calibrations[token] = _read_calibration(tables, token, row.where)
