@@ -8,7 +8,6 @@ seconds since the epoch (float64 holds them to 0.2 us) unless named otherwise.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -16,12 +15,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.source_logs.log import naming
-from lidarpainter_models.readers.waymo.calibration import (
-    CameraCalibration,
-    LidarCalibration,
-    finite_numbers,
-    rigid_pose,
-)
+from lidarpainter_models.readers.waymo.calibration import finite_numbers, rigid_pose
 from lidarpainter_models.scenes.validation import require_name, require_size
 
 CATEGORIES = {0: "unknown", 1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
@@ -105,33 +99,6 @@ class WaymoSweep:
     pixel_poses: np.ndarray | None
     """float32 (rows, columns, 6): roll pitch yaw x y z of the vehicle in the global frame."""
     place: str
-
-
-@runtime_checkable
-class WaymoSegment(Protocol):
-    """One segment in either release."""
-
-    place: str
-    """File or folder, to name in errors."""
-    cameras: dict[str, CameraCalibration]
-    lidars: dict[str, LidarCalibration]
-
-    @property
-    def num_frames(self) -> int:
-        """How many frames there are."""
-        ...
-
-    def read_frame(self, index: int) -> WaymoFrame:
-        """Time, pose and labels of one frame."""
-        ...
-
-    def read_sensors(self, index: int) -> tuple[list[WaymoImage], list[WaymoSweep]]:
-        """Images and range images of one frame; frames are asked for in ascending order."""
-        ...
-
-    def provenance(self) -> dict[str, object]:
-        """What was read, with a digest."""
-        ...
 
 
 def checked_speed(x_mps: float, y_mps: float, place: str) -> float:

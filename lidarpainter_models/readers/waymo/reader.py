@@ -44,13 +44,7 @@ from lidarpainter_models.readers.waymo.cameras import (
     global_from_vehicle_at,
     image_record,
 )
-from lidarpainter_models.readers.waymo.log import (
-    MAX_LAG_S,
-    WaymoFrame,
-    WaymoImage,
-    WaymoSegment,
-    WaymoSweep,
-)
+from lidarpainter_models.readers.waymo.log import MAX_LAG_S, WaymoFrame, WaymoImage, WaymoSweep
 from lidarpainter_models.readers.waymo.parquet import WaymoParquetSegment
 from lidarpainter_models.readers.waymo.range_images import range_points
 from lidarpainter_models.readers.waymo.tfrecord import WaymoRecordSegment
@@ -178,11 +172,8 @@ class WaymoLog:
         self, frame: WaymoFrame, sweeps: list[WaymoSweep], points: FramePoints
     ) -> list[SourceSweep]:
         """The sweeps that have points, which are added to those of the frame."""
-        found = [
-            sweep
-            for sweep in (self._sweep(frame, sweep, points) for sweep in sweeps)
-            if sweep is not None
-        ]
+        read = (self._sweep(frame, sweep, points) for sweep in sweeps)
+        found = [sweep for sweep in read if sweep is not None]
         if not found:
             raise DataError("no LiDAR has a point, expected range images")
         if TOP in self._segment.lidars and TOP not in [sweep.lidar_name for sweep in found]:
@@ -238,7 +229,7 @@ def _segments(root: Path) -> Iterator[tuple[str, Path]]:
             yield path.stem, path
 
 
-def _open_segment(root: Path, sequence: str) -> WaymoSegment:
+def _open_segment(root: Path, sequence: str) -> WaymoRecordSegment | WaymoParquetSegment:
     found = sorted(path for name, path in _segments(root) if name == sequence)
     if not found:
         raise DataError(f"{root}: no segment {sequence}, expected a TFRecord or Parquet file of it")
