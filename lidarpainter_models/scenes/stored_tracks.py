@@ -45,16 +45,7 @@ def tracks_from_arrays(
     for record, size_m in zip(records, arrays["size_m"], strict=True):
         rows = slice(start, start + record["num_times"])
         start = rows.stop
-        tracks.append(
-            ActorTrack(
-                actor_id=record["actor_id"],
-                category=record["category"],
-                is_moving=record["is_moving"],
-                size_m=size_m,
-                frame_indices=arrays["frame_indices"][rows],
-                timestamps_ns=arrays["timestamps_ns"][rows],
-                world_from_box=arrays["world_from_box"][rows],
-                num_points=arrays["num_points"][rows],
-            )
-        )
+        known = {name: record[name] for name in ("actor_id", "category", "is_moving")}
+        times: dict[str, Any] = {name: arrays[name][rows] for name in COLUMNS if name != "size_m"}
+        tracks.append(ActorTrack(**known, size_m=size_m, **times))
     return tuple(tracks)

@@ -16,7 +16,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
-from lidarpainter_models.scenes.image_bytes import MAX_IMAGE_PIXELS, can_decode
+from lidarpainter_models.scenes.image_bytes import can_decode, require_pixels
 from lidarpainter_models.scenes.records import Distortion, RollingShutter
 from lidarpainter_models.scenes.schema import MAX_NAME_LENGTH, is_safe_name
 from lidarpainter_models.scenes.undistortion import pinhole_of
@@ -204,11 +204,7 @@ def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
         if marker in _START_OF_FRAME:
             height_px = int.from_bytes(jpeg[position + 5 : position + 7], "big")
             width_px = int.from_bytes(jpeg[position + 7 : position + 9], "big")
-            if not 0 < width_px * height_px <= MAX_IMAGE_PIXELS:
-                raise DataError(
-                    f"{where}: the JPEG image states {width_px} x {height_px} px, expected at "
-                    f"most {MAX_IMAGE_PIXELS // 1_000_000} million"
-                )
+            require_pixels(width_px, height_px, where)
             return width_px, height_px
         if marker == 0xFF:  # padding before a marker
             position += 1

@@ -6,6 +6,7 @@ docs/canonical-format.md says before any library opens them.
 """
 
 import json
+import math
 import re
 import stat
 from pathlib import Path
@@ -42,7 +43,7 @@ def read_foreign_manifest(folder: Path) -> dict[str, Any]:
         DataError: something is missing, damaged, or not what the format says.
     """
     file = folder / schema.MANIFEST_NAME
-    manifest = read_small_json(file, MAX_MANIFEST_BYTES)
+    manifest = read_small_json(file)
     if manifest.get("is_complete") is not True:
         raise DataError(f"{file}: is_complete is not true: the scene was not written to its end")
     version = manifest.get("schema_version")
@@ -66,12 +67,12 @@ def read_foreign_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def read_small_json(file: Path, max_bytes: int) -> dict[str, Any]:
-    """A JSON object from a regular file of bounded size."""
+def read_small_json(file: Path) -> dict[str, Any]:
+    """A JSON object from a regular file of at most `MAX_MANIFEST_BYTES`."""
     try:
         status = file.lstat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > max_bytes:
-            raise DataError(f"{file}: expected a file of at most {max_bytes} bytes")
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_MANIFEST_BYTES:
+            raise DataError(f"{file}: expected a file of at most {MAX_MANIFEST_BYTES} bytes")
         value = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, DataError):
@@ -210,7 +211,7 @@ def _text_bytes(column: pa.ChunkedArray) -> int:
 
 
 def _require_group(folder: Path) -> None:
-    metadata = read_small_json(folder / "zarr.json", MAX_MANIFEST_BYTES)
+    metadata = read_small_json(folder / "zarr.json")
     if metadata.get("zarr_format") != 3 or metadata.get("node_type") != "group":
         raise DataError(f"{folder / 'zarr.json'}: no group of Zarr version 3")
 
@@ -218,7 +219,7 @@ def _require_group(folder: Path) -> None:
 def _require_array(folder: Path, layout: schema.ArrayLayout, num_rows: int) -> None:
     """The metadata word for word, and no chunk that unpacks to more than its size."""
     file = folder / "zarr.json"
-    metadata = read_small_json(file, MAX_MANIFEST_BYTES)
+    metadata = read_small_json(file)
     expected = schema.zarr_metadata(layout, num_rows)
     for key, value in expected.items():
         found = metadata.get(key)
@@ -228,9 +229,7 @@ def _require_array(folder: Path, layout: schema.ArrayLayout, num_rows: int) -> N
             raise DataError(f"{file}: {key} is {found!r:.120}, expected {value!r:.200}")
     if unknown := set(metadata) - {*expected, "attributes", "dimension_names"}:
         raise DataError(f"{file}: {', '.join(sorted(unknown))!r:.80} is not part of the format")
-    chunk_bytes = layout.dtype.itemsize * layout.chunk_rows
-    for size in layout.row_shape:
-        chunk_bytes *= size
+    chunk_bytes = layout.dtype.itemsize * math.prod((layout.chunk_rows, *layout.row_shape))
     inner = "/".join("0" * len(layout.row_shape))
     for number in range(-(-num_rows // layout.chunk_rows)):
         _require_chunk(folder / "c" / str(number) / inner, chunk_bytes)

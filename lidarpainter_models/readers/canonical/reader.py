@@ -15,11 +15,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.canonical.checks import (
-    MAX_MANIFEST_BYTES,
-    read_foreign_manifest,
-    read_small_json,
-)
+from lidarpainter_models.readers.canonical.checks import read_foreign_manifest, read_small_json
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import image_of_row
@@ -52,7 +48,7 @@ def own_scene_id(root: Path, sequence: str) -> str:
         DataError: there is no manifest, or it says no names.
     """
     file = _scene_folder(root, sequence) / schema.MANIFEST_NAME
-    manifest = read_small_json(file, MAX_MANIFEST_BYTES)
+    manifest = read_small_json(file)
     names = (str(manifest.get(key, "")) for key in ("dataset", "sequence"))
     return "/".join(require_name(name, f"{file}: dataset or sequence") for name in names)
 
