@@ -10,8 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
@@ -99,8 +97,10 @@ def _record_image(
     bgr = np.round(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
     _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     stated = street.camera(rig.name, timestamp_ns)
-    error = _pose_error(rng, config.pose_noise_rad, config.pose_noise_m)
-    error = _turned_right(rig.yaw_error_rad) @ error
+    # turned to the left it is stored as turned to the right, in its own frame: y is down
+    turn = torch.tensor([0.0, rig.yaw_error_rad, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    noise = np.repeat([config.pose_noise_rad, config.pose_noise_m], 3) * rng.standard_normal(6)
+    error = rigid_from_tangent(turn) @ rigid_from_tangent(torch.from_numpy(noise))
     writer.add_image(
         ImageRecord(
             camera_name=rig.name,
@@ -136,20 +136,3 @@ def _record_boxes(
                 num_points=num_points,
             )
         )
-
-
-def _turned_right(angle_rad: float) -> Float[Tensor, "4 4"]:
-    """What a camera turned to the left by an angle is stored as, in its own frame (y is down)."""
-    turn = torch.zeros(6, dtype=torch.float64)
-    turn[1] = angle_rad
-    return rigid_from_tangent(turn)
-
-
-def _pose_error(
-    rng: np.random.Generator, angle_rad: float, position_m: float
-) -> Float[Tensor, "4 4"]:
-    """A random small motion in the camera's own frame."""
-    tangent = np.concatenate(
-        [angle_rad * rng.standard_normal(3), position_m * rng.standard_normal(3)]
-    )
-    return rigid_from_tangent(torch.from_numpy(tangent))

@@ -30,11 +30,9 @@ class StreetLine:
         wavelength_m: float,
         phase_rad: float,
         rise_m: float,
-        start_m: float = -160.0,
-        end_m: float = 460.0,
     ) -> "StreetLine":
         """A line whose curvature swings between +-`curvature_per_m`, rising up to 2 `rise_m`."""
-        s = np.arange(start_m, end_m + STEP_M / 2, STEP_M)
+        s = np.arange(-160.0, 460.0 + STEP_M / 2, STEP_M)
         curvature = curvature_per_m * np.sin(2 * np.pi * s / wavelength_m + phase_rad)
         zero = int(np.argmin(np.abs(s)))
         heading = _integral(curvature)

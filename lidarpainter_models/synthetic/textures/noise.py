@@ -55,11 +55,10 @@ def coarse_noise(
     shape: tuple[int, int],
     cells: tuple[int, int],
     *,
-    persistence: float = 0.5,
-    shrink: int = 4,
+    persistence: float,
 ) -> np.ndarray:
-    """Four octaves of noise for large images: made `shrink` times smaller, then enlarged."""
-    small = max(shape[0] // shrink, 2), max(shape[1] // shrink, 2)
+    """Four octaves of noise for large images: made four times smaller, then enlarged."""
+    small = max(shape[0] // 4, 2), max(shape[1] // 4, 2)
     field = fractal_noise(rng, small, cells, octaves=4, persistence=persistence)
     return cv2.resize(field, shape[::-1], interpolation=cv2.INTER_LINEAR)
 

@@ -104,21 +104,15 @@ class MeshBuilder:
         """
         count = corners.shape[0]
         geometry = np.zeros((count, GEOMETRY_COLUMNS))
-        geometry[:, 0:3] = corners[:, 0]
-        geometry[:, 3:6] = corners[:, 1] - corners[:, 0]
-        geometry[:, 6:9] = corners[:, 2] - corners[:, 0]
+        geometry[:, :9] = _with_changes(corners)
         geometry[:, IS_PARALLELOGRAM] = float(is_parallelogram)
         if normals is None:
             flat = _cross(geometry[:, 3:6], geometry[:, 6:9])
             flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
             normals = np.repeat(flat[:, None], 3, axis=1)
         shading = np.zeros((count, SHADING_COLUMNS))
-        shading[:, 0:3] = normals[:, 0]
-        shading[:, 3:6] = normals[:, 1] - normals[:, 0]
-        shading[:, 6:9] = normals[:, 2] - normals[:, 0]
-        shading[:, UV_CORNER : UV_CORNER + 2] = uv[:, 0]
-        shading[:, UV_CORNER + 2 : UV_CORNER + 4] = uv[:, 1] - uv[:, 0]
-        shading[:, UV_CORNER + 4 : UV_CORNER + 6] = uv[:, 2] - uv[:, 0]
+        shading[:, :9] = _with_changes(normals)
+        shading[:, UV_CORNER : UV_CORNER + 6] = _with_changes(uv)
         surfaces = np.broadcast_to(np.asarray(surface, np.int32), (count,)).copy()
         self.parts.append(Mesh(geometry, shading, surfaces))
 
@@ -146,6 +140,12 @@ class MeshBuilder:
                 surface,
                 normals=None if normals is None else cell_corners(normals, order),
             )
+
+
+def _with_changes(values: np.ndarray) -> np.ndarray:
+    """Values (rows, 3, numbers) as rows: at the corner, then their changes along both edges."""
+    corner, first, second = values[:, 0], values[:, 1], values[:, 2]
+    return np.concatenate([corner, first - corner, second - corner], axis=1)
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -79,17 +79,11 @@ def _add_cap(builder: MeshBuilder, centre: np.ndarray, rim: np.ndarray, surface:
 
 
 def add_ball(
-    builder: MeshBuilder,
-    centre: Vector,
-    radii: Vector,
-    surface: int,
-    *,
-    rows: int = 6,
-    columns: int = 10,
+    builder: MeshBuilder, centre: Vector, radii: Vector, surface: int, *, rows: int = 6
 ) -> None:
-    """An ellipsoid."""
+    """An ellipsoid, of ten columns."""
     lines = np.linspace(0, np.pi, rows + 1)[:, None]
-    turns = np.linspace(0, 2 * np.pi, columns + 1)[None, :]
+    turns = np.linspace(0, 2 * np.pi, 11)[None, :]
     unit = np.stack(
         [np.sin(lines) * np.cos(turns), np.sin(lines) * np.sin(turns), np.cos(lines) + 0 * turns],
         axis=-1,
