@@ -1,6 +1,5 @@
 """Each way to get a scene wrong is found by the check that looks for it."""
 
-import json
 import shutil
 from dataclasses import replace
 from itertools import combinations
@@ -34,12 +33,6 @@ from lidarpainter_models.checks.sweeps import (
     check_sweeps_agree,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-
-
-def edit_json(log, name, change):
-    value = json.loads((log.path / name).read_text())
-    change(value)
-    (log.path / name).write_text(json.dumps(value))
 
 
 def ingested(log, tmp_path, **options):
@@ -243,8 +236,8 @@ def test_a_pause_of_the_recorder_is_told_with_its_place(scene):
 
 def test_camera_that_leaves_its_mount_is_found(pandaset, tmp_path):
     move = {"x": 103.0, "y": -47.0}
-    edit_json(
-        pandaset, "camera/back_camera/poses.json", lambda poses: poses[1]["position"].update(move)
+    pandaset.edit_json(
+        "camera/back_camera/poses.json", lambda poses: poses[1]["position"].update(move)
     )
     assert check_camera_rig(ingested(pandaset, tmp_path))[0] == "warn"
 
@@ -275,23 +268,15 @@ def test_camera_that_looks_into_the_sky_is_found(scene):
     assert "right_camera 0%" in detail
 
 
-def moved_points(log, index, change):
-    """Rewrite one frame's points with their positions changed."""
-    name = f"lidar/{index:02d}.pkl.gz"
-    table = log.read_table(name)
-    xyz_m = change(np.stack([table[axis] for axis in "xyz"], axis=1))
-    log.write_table(name, {**table, **dict(zip("xyz", xyz_m.T, strict=True))})
-
-
 def test_sweep_that_lies_beside_the_others_is_found(pandaset, tmp_path):
-    moved_points(pandaset, 1, lambda xyz_m: xyz_m + np.array([0.4, 0.4, 0.3]))
+    pandaset.edit_points(1, lambda xyz_m: xyz_m + np.array([0.4, 0.4, 0.3]))
     assert check_sweeps_agree(ingested(pandaset, tmp_path))[0] == "fail"
 
 
 def test_ground_that_stands_on_edge_is_found(pandaset, tmp_path):
     for index in range(3):
-        moved_points(
-            pandaset, index, lambda xyz_m: xyz_m + 0.3 * (xyz_m[:, :1] - 100.0) * [[0, 0, 1]]
+        pandaset.edit_points(
+            index, lambda xyz_m: xyz_m + 0.3 * (xyz_m[:, :1] - 100.0) * [[0, 0, 1]]
         )
     assert check_ground(ingested(pandaset, tmp_path))[0] == "fail"
 

@@ -1,23 +1,9 @@
 """A log that no car recorded is refused with the file of what cannot be; nothing is stored."""
 
-import json
-
 import numpy as np
 import pytest
 
 from lidarpainter_models.errors import DataError
-
-
-def edit_json(log, name, change):
-    value = json.loads((log.path / name).read_text())
-    (log.path / name).write_text(json.dumps(change(value) or value))
-
-
-def edit_points(log, index, change):
-    name = f"lidar/{index:02d}.pkl.gz"
-    table = log.read_table(name)
-    xyz_m = change(np.stack([table[axis] for axis in "xyz"], axis=1))
-    log.write_table(name, {**table, **dict(zip("xyz", xyz_m.T, strict=True))})
 
 
 @pytest.fixture
@@ -81,7 +67,7 @@ UPRIGHT = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
     ids=["jump", "spin", "other time", "time stands still", "off the car", "sky", "past its image"],
 )
 def test_what_no_car_records_is_refused(pandaset, refusal, name, change, complaint):
-    edit_json(pandaset, f"{name}.json", change)
+    pandaset.edit_json(f"{name}.json", change)
     assert complaint in refusal()
 
 
@@ -90,13 +76,13 @@ def test_point_beyond_the_reach_of_a_lidar(pandaset, refusal):
         xyz_m[7, 2] += 5000.0
         return xyz_m
 
-    edit_points(pandaset, 1, throw)
+    pandaset.edit_points(1, throw)
     assert "lidar/01.pkl.gz: a point is 4998 m from its LiDAR, expected 1000 m" in refusal()
 
 
 def test_points_of_chance(pandaset, refusal):
     rng = np.random.default_rng(0)
-    edit_points(pandaset, 1, lambda xyz_m: xyz_m + rng.uniform(-50, 50, xyz_m.shape))
+    pandaset.edit_points(1, lambda xyz_m: xyz_m + rng.uniform(-50, 50, xyz_m.shape))
     assert "lidar/01.pkl.gz: the points lie" in refusal()
 
 
@@ -130,5 +116,5 @@ def test_some_empty_boxes_are_left_to_the_doctor(
 
 def test_camera_that_sees_points_in_one_image_is_taken(pandaset, tmp_path):
     name = "camera/right_camera/poses.json"
-    edit_json(pandaset, name, lambda poses: poses[0]["heading"].update(UPRIGHT))
+    pandaset.edit_json(name, lambda poses: poses[0]["heading"].update(UPRIGHT))
     assert pandaset.ingest(tmp_path / "store").is_dir()

@@ -6,6 +6,7 @@ drives at 8 m/s, another is parked on the left. Both LiDARs see the moving one, 
 
 import gzip
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,19 @@ class PandasetFolder:
 
     def read_table(self, name: str) -> dict[str, np.ndarray]:
         return read_table_bytes((self.path / name).read_bytes(), self.path / name)
+
+    def edit_json(self, name: str, change: Callable[[Any], object]) -> None:
+        """Let `change` work on what a file holds, then write what it left or gave."""
+        value = json.loads((self.path / name).read_text())
+        changed = change(value)
+        self.write(name, changed if isinstance(changed, list) else value)
+
+    def edit_points(self, index: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Put the points of a frame where `change` says."""
+        name = f"lidar/{index:02d}.pkl.gz"
+        table = self.read_table(name)
+        xyz_m = change(np.stack([table[axis] for axis in "xyz"], axis=1))
+        self.write_table(name, {**table, **dict(zip("xyz", xyz_m.T, strict=True))})
 
     def boxes_at(self, time_s: float) -> list[dict[str, Any]]:
         """The parked car once, the moving one as each LiDAR saw it."""

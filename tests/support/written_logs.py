@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import pytest
 from av2_log import LOG, street_like_av2, write_av2_log
 from bag_log import write_foxglove_bag, write_ros_bag
 from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
@@ -20,6 +21,7 @@ from waymo_numbers import SEGMENT
 from waymo_records import write_v1
 from waymo_truth import street_config, write_truth
 
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import (
@@ -50,6 +52,17 @@ class WrittenLog:
 
     def read(self, store, **options):
         return DrivingScene.open(self.ingest(store, **options))
+
+    def refusal(self, store, **options):
+        """The one line with which it is refused; no file is left in the store."""
+        with pytest.raises(DataError) as raised:
+            self.ingest(store, **options)
+        assert type(raised.value) is DataError
+        assert [path for path in store.rglob("*") if path.is_file()] == []
+        message = str(raised.value)
+        assert "\n" not in message
+        assert str(self.root) in message
+        return message
 
     def copied(self, root):
         """The same log elsewhere, free to be damaged."""

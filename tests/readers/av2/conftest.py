@@ -1,14 +1,8 @@
-"""A synthetic street as an Argoverse 2 log: read once, and a copy free to be damaged."""
+"""A synthetic street as an Argoverse 2 log, and what is read of it."""
 
 import pytest
-from av2_log import LOG, street_like_av2, write_av2_log
+from av2_log import LOG, write_av2_log
 from written_logs import WrittenLog
-
-
-@pytest.fixture(scope="session")
-def street(tmp_path_factory):
-    """The truth: three sweeps, two cameras, far from the origin of the city."""
-    return street_like_av2(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="session")
@@ -21,8 +15,3 @@ def sound_log(street, tmp_path_factory):
 @pytest.fixture(scope="session")
 def read_street(sound_log, tmp_path_factory):
     return sound_log.read(tmp_path_factory.mktemp("store"))
-
-
-@pytest.fixture
-def log(sound_log, tmp_path):
-    return sound_log.copied(tmp_path / "log")

@@ -15,16 +15,6 @@ LENSES, MOUNTS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_s
 SWEEP = "sensors/lidar/*.feather"
 
 
-def refusal(log, store):
-    with pytest.raises(DataError) as raised:
-        log.ingest(store)
-    assert [path for path in store.rglob("*") if path.is_file()] == []
-    message = str(raised.value)
-    assert "\n" not in message
-    assert str(log.root) in message
-    return message
-
-
 def edit(log, pattern, column, value):
     """Write a table anew with another column, without it (None), or with another first value."""
     file = sorted((log.root / LOG).glob(pattern))[0]
@@ -59,13 +49,13 @@ def edit(log, pattern, column, value):
 )
 def test_senseless_value(log, tmp_path, pattern, column, value, expected):
     edit(log, pattern, column, value)
-    assert expected in refusal(log, tmp_path / "store")
+    assert expected in log.refusal(tmp_path / "store")
 
 
 def test_log_without_sweeps(log, tmp_path):
     for file in (log.root / LOG).glob(SWEEP):
         file.unlink()
-    assert "no sweep, expected TIME.feather" in refusal(log, tmp_path / "store")
+    assert "no sweep, expected TIME.feather" in log.refusal(tmp_path / "store")
 
 
 def feather(tmp_path, content):

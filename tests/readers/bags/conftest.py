@@ -1,14 +1,7 @@
 """A synthetic street as bags of ROS 2 and of Foxglove."""
 
 import pytest
-from av2_log import street_like_av2
 from bag_log import write_foxglove_bag, write_ros_bag
-
-
-@pytest.fixture(scope="session")
-def street(tmp_path_factory):
-    """The truth: three sweeps of a LiDAR that takes its time, two cameras, far from the origin."""
-    return street_like_av2(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="session")

@@ -23,16 +23,6 @@ RAYS = "lidars/*/frames/*/ray_bundle/direction/.zarray"
 FRAMES = "lidars/*/frames/.zattrs"
 
 
-def refusal(log, store):
-    with pytest.raises(DataError) as raised:
-        log.ingest(store)
-    assert [path for path in store.rglob("*") if path.is_file()] == []
-    message = str(raised.value)
-    assert "\n" not in message
-    assert str(log.root) in message
-    return message
-
-
 def edit(log, group, pattern, change):
     """Change the JSON of a record of a store."""
     folder = log.root / f"{SEQUENCE}.ncore4{group}.zarr"
@@ -118,7 +108,7 @@ CASES = [
 @pytest.mark.parametrize(("group", "pattern", "change", "expected"), CASES)
 def test_senseless_value(log, tmp_path, group, pattern, change, expected):
     edit(log, group, pattern, change)
-    assert expected in refusal(log, tmp_path / "store")
+    assert expected in log.refusal(tmp_path / "store")
     assert not (tmp_path / "x").exists()
 
 
@@ -138,7 +128,7 @@ def test_array_that_would_be_unpickled_is_refused_and_nothing_is_run(log, tmp_pa
     folder = log.root / f"{SEQUENCE}.ncore4{LIDAR}.zarr"
     chunk = sorted(folder.glob(RAYS))[0].with_name("0.0")
     chunk.write_bytes(pickle.dumps(np.array([Bomb(tmp_path / "ran")], dtype=object)))
-    assert "plain or packed by Blosc" in refusal(log, tmp_path / "store")
+    assert "plain or packed by Blosc" in log.refusal(tmp_path / "store")
     assert not (tmp_path / "ran").exists()
 
 
@@ -147,7 +137,7 @@ def test_record_that_is_a_pipe_ends_in_a_line(log, tmp_path):
     file = sorted(folder.glob(FRAMES))[0]
     file.unlink()
     os.mkfifo(file)
-    refusal(log, tmp_path / "store")
+    log.refusal(tmp_path / "store")
 
 
 @pytest.fixture(scope="module")
@@ -221,4 +211,4 @@ def test_packed_chunk_that_says_it_is_larger_is_not_unpacked(log, tmp_path):
     packed = bytearray(blosc.compress(bytes(1 << 16), b"lz4", 5))
     packed[4:8] = (2**31 - 1).to_bytes(4, "little")
     chunk.write_bytes(packed)
-    assert "a chunk cannot be unpacked" in refusal(log, tmp_path / "store")
+    assert "a chunk cannot be unpacked" in log.refusal(tmp_path / "store")

@@ -1,28 +1,18 @@
 """A synthetic street as a nuScenes log: whole, read only once, and small, to be damaged."""
 
 import json
-import shutil
-from pathlib import Path
 
 import pytest
 from nuscenes_log import SCENE_NAME, reduced, street_like_nuscenes, write_nuscenes_log
-
-from lidarpainter_models.readers import ingest_scene
-from lidarpainter_models.scenes.driving_scene import DrivingScene
+from written_logs import WrittenLog
 
 
-class NuscenesLog:
+class NuscenesLog(WrittenLog):
     """A log whose tables can be changed."""
 
-    def __init__(self, root):
-        self.root = Path(root)
-        self.folder = self.root / "v1.0-mini"
-
-    def ingest(self, store, **options):
-        return ingest_scene("nuscenes", self.root, SCENE_NAME, store, **options)
-
-    def read(self, store, **options):
-        return DrivingScene.open(self.ingest(store, **options))
+    @property
+    def folder(self):
+        return self.root / "v1.0-mini"
 
     def rows(self, table):
         return json.loads((self.folder / f"{table}.json").read_text())
@@ -50,7 +40,7 @@ def street_log(street, tmp_path_factory):
     """The street written as nuScenes, every third sweep a key frame."""
     root = tmp_path_factory.mktemp("log")
     write_nuscenes_log(street, root, key_every=3)
-    return NuscenesLog(root)
+    return NuscenesLog("nuscenes", root, SCENE_NAME)
 
 
 @pytest.fixture(scope="session")
@@ -70,16 +60,4 @@ def sound_log(small_street, tmp_path_factory):
     """The small street as nuScenes; key frames are the first and the last sweep."""
     root = tmp_path_factory.mktemp("small-log")
     write_nuscenes_log(small_street, root, key_every=3)
-    return NuscenesLog(root)
-
-
-@pytest.fixture
-def log(sound_log, tmp_path):
-    """The small log, free to be changed."""
-    shutil.copytree(sound_log.root, tmp_path / "log")
-    return NuscenesLog(tmp_path / "log")
-
-
-@pytest.fixture
-def store(tmp_path):
-    return tmp_path / "store"
+    return NuscenesLog("nuscenes", root, SCENE_NAME)

@@ -5,19 +5,9 @@ import os
 import numpy as np
 import pytest
 
-from lidarpainter_models.errors import DataError, LidarPainterError
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.nuscenes.reader import list_nuscenes_scenes
 from lidarpainter_models.readers.nuscenes.tables import MAX_ROW_BYTES, NuscenesTable
-
-
-def refusal(log, store, **options):
-    with pytest.raises(LidarPainterError) as raised:
-        log.ingest(store, **options)
-    assert [path for path in store.rglob("*") if path.is_file()] == []
-    message = str(raised.value)
-    assert "\n" not in message
-    assert type(raised.value) is DataError
-    return message
 
 
 def set_in(key, value, number=0):
@@ -61,15 +51,13 @@ CASES = [
 @pytest.mark.parametrize(("table", "change", "expected"), CASES)
 def test_senseless_row(log, store, table, change, expected):
     log.edit(table, change)
-    message = refusal(log, store)
-    assert expected in message
-    assert str(log.root) in message
+    assert expected in log.refusal(store)
 
 
 def test_instance_that_is_no_name(log, store):
     log.edit("instance", set_in("token", "../../x"))
     log.edit("sample_annotation", lambda rows: [{**rows[0], "instance_token": "../../x"}])
-    message = refusal(log, store)
+    message = log.refusal(store)
     assert "instance.json, token '../../x': actor name '../../x' cannot be used" in message
 
 
@@ -88,7 +76,7 @@ def test_table_that_never_ends(log, store):
     path = log.folder / "category.json"
     path.unlink()
     os.mkfifo(path)
-    assert refusal(log, store).endswith("category.json: not a file")
+    assert log.refusal(store).endswith("category.json: not a file")
 
 
 def sweep_file(log):
@@ -105,14 +93,14 @@ def write_points(file, change):
 def test_truncated_sweep(log, store, kept):
     file = sweep_file(log)
     file.write_bytes(file.read_bytes()[:kept])
-    message = refusal(log, store)
+    message = log.refusal(store)
     assert f"{file.name}: " in message
     assert "expected whole points of 20 bytes" in message
 
 
 def test_sweep_of_more_than_a_turn(log, store, monkeypatch):
     monkeypatch.setattr("lidarpainter_models.readers.nuscenes.sweeps._MAX_FILE_BYTES", 100)
-    message = refusal(log, store)
+    message = log.refusal(store)
     assert message.endswith(": more than 100 bytes, expected one turn of a LiDAR")
 
 
@@ -129,7 +117,7 @@ def test_senseless_point(log, store, column, value, expected):
         rows[7, column] = value
 
     write_points(sweep_file(log), change)
-    assert expected in refusal(log, store)
+    assert expected in log.refusal(store)
 
 
 @pytest.mark.parametrize("blank", ["", " \n\t\r"])
