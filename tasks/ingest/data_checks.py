@@ -50,8 +50,12 @@ def check_stored_scene(
 ) -> list[Finding]:
     """Check a scene of the store; writes an overlay image and all findings as JSON.
 
-    `out` is a file or folder for the image, by default the store's folder `doctor`; the JSON lies
-    beside it under the same name.
+    Args:
+        store: where the scene is.
+        scene_id: its dataset and sequence, with a slash between.
+        out: a file or folder for the overlay image, by default the store's folder `doctor`; the
+            JSON lies beside it under the same name.
+        looking_at: told what is looked at next.
     """
     scene = open_scene(store, scene_id)
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"

@@ -77,10 +77,13 @@ def compared(store: Store, scene_id: str, found: StageResult) -> list[dict[str, 
 def ingest_labelled(
     store_path: Path, scene_id: str, found: StageResult, sequence: str | None
 ) -> dict[str, Any]:
-    """Write a scene with boxes of those whom `label` found; returns its row in `scenes`.
+    """Write a scene with boxes of those who have none; returns its row in `scenes`.
 
-    Boxes that it has are kept. The new scene is called `sequence` in its dataset; as the old one
-    with a suffix if None.
+    Args:
+        store_path: where both scenes are.
+        scene_id: whose movers were found; boxes that it has are kept.
+        found: what `label` gave.
+        sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
 
     Raises:
         ConfigError: a scene of that name is there that was made otherwise.
@@ -106,8 +109,11 @@ def ingest_edited(
 ) -> dict[str, Any]:
     """Write a scene with its boxes as a person changed them; returns its row in `scenes`.
 
-    The `edits` are the file that `view --label` wrote; the new scene is called as by
-    `ingest_labelled`.
+    Args:
+        store_path: where both scenes are.
+        scene_id: whose boxes are changed.
+        edits: the file that `view --label` wrote.
+        sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
 
     Raises:
         ConfigError: the file is no file of edits, its edits are of another scene, or a scene of
@@ -164,8 +170,13 @@ def label_by_hand(
 ) -> None:
     """Show a scene's boxes in a browser until stopped, and write what is changed about them.
 
-    The file of `edits` is read first where it is there. No port takes a free one; `opened_at` is
-    told the address.
+    Args:
+        store: where the scene is.
+        scene_id: whose boxes are shown.
+        edits: the file that is written, and read first where it is there.
+        port: where to listen; None takes a free one.
+        opened_at: told the address.
+        stopped: ends the viewer when it is set.
 
     Raises:
         ConfigError: the port cannot be had, the file cannot be written, or is no file of edits of

@@ -50,9 +50,13 @@ def localise(store_path: Path, scene_id: str) -> StageResult:
 def ingest_localised(
     store_path: Path, scene_id: str, found: StageResult, sequence: str | None
 ) -> dict[str, Any]:
-    """Write a scene with the poses that `localise` found; returns its row in `scenes`.
+    """Write a scene with the poses that were found; returns its row in `scenes`.
 
-    The new scene is called `sequence` in its dataset; as the old one with a suffix if None.
+    Args:
+        store_path: where both scenes are.
+        scene_id: whose poses were found.
+        found: what `localise` gave.
+        sequence: name of the new scene in its dataset; that of the old one and a suffix if None.
 
     Raises:
         ConfigError: a scene of that name is there that was made otherwise.

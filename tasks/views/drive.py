@@ -80,9 +80,14 @@ def view_live(
 ) -> None:
     """Show a drive in a browser until stopped; tells its address when it is there.
 
-    People choose from the fitted `scenes` by name, of which the first is shown first; painters are
-    shown that of `viewed`. `lidar` is what the log's first LiDAR was learnt to see; without it
-    there are no simulated sweeps. No port takes a free one.
+    Args:
+        viewed: the run whose path is followed, and whose scene painters are shown.
+        request: the camera and the frames that are followed.
+        scenes: fitted scenes by the names that people choose from; the first is shown first.
+        lidar: what the log's first LiDAR was learnt to see; None shows no simulated sweeps.
+        port: where to listen; None takes a free one.
+        opened_at: told the address.
+        stopped: ends the viewer when it is set.
 
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.

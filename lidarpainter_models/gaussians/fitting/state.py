@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors
-from lidarpainter_models.gaussians.fitting.config import FitConfig, LearningRates
+from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.loss import Perceptual
 from lidarpainter_models.gaussians.fitting.occlusion_culling import HiddenGaussians
 from lidarpainter_models.gaussians.fitting.refinement import Refinement

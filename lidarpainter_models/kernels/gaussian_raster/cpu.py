@@ -96,9 +96,17 @@ class _DrawView(torch.autograd.Function):
 
 def _room_for_gradients(gaussians: Gaussians) -> Gradients:
     """Arrays for `unproject` to fill."""
-    floats = [np.empty_like(array) for array in gaussians[:6]]
-    transforms = np.zeros((CHUNKS, len(gaussians.camera_from_body), 3, 4))
-    return Gradients._make([*floats, transforms, np.empty_like(gaussians.opacity)])
+    count, bodies = len(gaussians.means), len(gaussians.camera_from_body)
+    return Gradients(
+        means=np.empty((count, 3), np.float32),
+        rotation_wxyz=np.empty((count, 4), np.float32),
+        scale_m=np.empty((count, 3), np.float32),
+        opacity=np.empty(count, np.float32),
+        sh=np.empty(gaussians.sh.shape, np.float32),
+        features=np.empty(gaussians.features.shape, np.float32),
+        camera_from_body=np.zeros((CHUNKS, bodies, 3, 4)),
+        absolute=np.empty(count, np.float32),
+    )
 
 
 def _tensor_gradients(found: Gradients, tensors: tuple[Tensor, ...]) -> list[Tensor]:

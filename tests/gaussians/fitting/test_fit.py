@@ -13,12 +13,12 @@ from lidarpainter_models.gaussians.fitting.config import (
     DensificationConfig,
     FitConfig,
     GuidanceConfig,
-    LearningRates,
     RefinementConfig,
     continuation,
 )
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene

@@ -5,7 +5,7 @@ import pytest
 import torch
 from gaussian_world import round_gaussians
 
-from lidarpainter_models.gaussians.fitting.config import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.state import (
     COLOUR_PIXELS,
     LEAST_SHAPE_GRADIENT,

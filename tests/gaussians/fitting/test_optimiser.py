@@ -1,6 +1,6 @@
 import torch
 
-from lidarpainter_models.gaussians.fitting.config import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.refinement import RowAdam
 
 

@@ -4,15 +4,14 @@ import pytest
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import (
-    COLOUR_LOOKS,
     START_SHARE,
     DensificationConfig,
     EffortConfig,
     FitConfig,
-    LearningRates,
     continuation,
 )
 from lidarpainter_models.gaussians.fitting.fit import HALF_STEP, steps_within, work_of
+from lidarpainter_models.gaussians.fitting.learning_rates import COLOUR_LOOKS, LearningRates
 from lidarpainter_models.gaussians.fitting.plan import planned_settings
 from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface
 

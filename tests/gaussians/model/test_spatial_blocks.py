@@ -6,7 +6,7 @@ import pytest
 import torch
 from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 
-from lidarpainter_models.gaussians.fitting.config import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.state import most_sigmas
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
