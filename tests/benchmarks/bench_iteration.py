@@ -1,6 +1,5 @@
 """A step of the fit: against its kernels, on a scene four times as long, and its memory."""
 
-import resource
 import time
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from bench_raster import STAGES, Stages
 from bench_records import Figure
 from bench_scenes import street_like_splats
 from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
+from gaussian_world import LOOK_FORWARD, scene_of, training_view
 from own_process import in_own_process
 from splat_drawing import render
 
@@ -17,15 +17,10 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementCo
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
-from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.drawing import camera_from_body
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
-from lidarpainter_models.observations.views import TrainingView
 
 SIZE = (30_000, 480, 320)
 MEMORY_SIZE = (1_000_000, 960, 640)
@@ -37,17 +32,16 @@ FLOATS_PER_GAUSSIAN = 59
 def street_scene(count, width_px, height_px, *, blocks=1):
     """`count` Gaussians before a camera in each block, the cameras being the training views."""
     splats = street_like_splats(count, width_px, height_px)
-    look_forward = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     cameras, sets = [], []
     for block in range(blocks):
         # each block looks away from the one before
         turn = torch.diag(torch.tensor([1.0, 1.0, 1.0]) if block % 2 == 0 else _BACKWARDS)
-        rotation = turn @ look_forward
+        rotation = turn @ LOOK_FORWARD
         place = torch.tensor([0.0, BLOCK_M * block, 1.0])
         cameras.append(splats["camera"].at(rigid_from_rotation(rotation, place).double()))
         sets.append(_placed(splats, rotation, place))
     gaussians = GaussianSet(**{name: torch.cat([s[name] for s in sets]) for name in sets[0]})
-    return _scene(gaussians, cameras), cameras
+    return scene_of(gaussians, cameras), cameras
 
 
 _BACKWARDS = torch.tensor([-1.0, -1.0, 1.0])
@@ -66,21 +60,6 @@ def _placed(splats, rotation, place):
     }
 
 
-def _scene(gaussians, cameras):
-    times = torch.arange(len(cameras)) * 100_000_000
-    return GaussianScene(
-        gaussians=gaussians,
-        sky=SkyTexture.constant(sky_layout(cameras), torch.tensor([0.6, 0.7, 0.9])),
-        cameras=CameraCorrections.none(
-            [(frame, "front") for frame in range(len(cameras))],
-            times,
-            torch.stack([camera.world_from_camera for camera in cameras]),
-        ),
-        actors=Actors.uncorrected((), times),
-        exposure=ExposureCorrections.none(["front"], [0]),
-    )
-
-
 def training_images(cameras):
     """A grey image with LiDAR depth in a tenth of the pixels for every camera."""
     generator = torch.Generator().manual_seed(1)
@@ -89,15 +68,9 @@ def training_images(cameras):
         shape = (camera.height_px, camera.width_px)
         is_hit = torch.rand(shape, generator=generator) < 0.1
         depth_m = 3.0 + 57.0 * torch.rand(shape, generator=generator)
-        view = TrainingView(
-            key=(frame, "front"),
-            camera=camera,
-            timestamp_ns=frame * 100_000_000,
-            rgb_u8=torch.randint(0, 255, (*shape, 3), generator=generator, dtype=torch.uint8),
-            sky_mask=torch.zeros(shape, dtype=torch.bool),
-            lidar_depth_m=torch.where(is_hit, depth_m, 0.0),
-        )
-        images.append(full_image(view))
+        rgb_u8 = torch.randint(0, 255, (*shape, 3), generator=generator, dtype=torch.uint8)
+        shown = {"rgb_u8": rgb_u8, "lidar_depth_m": torch.where(is_hit, depth_m, 0.0)}
+        images.append(full_image(training_view(camera, frame=frame, **shown)))
     return images
 
 
@@ -227,20 +200,16 @@ def _extra_bytes(count, width_px, height_px):
     small = Fit(100, width_px, height_px)
     small.step()  # compiles and allocates what does not depend on the number of Gaussians
     del small
-    before = _resident_bytes()
+    before = _process_bytes("VmRSS")
     fit = Fit(count, width_px, height_px)
     # forget the peak of building the scene; what it left unreturned counts against the step
     Path("/proc/self/clear_refs").write_text("5", "ascii")
     fit.step()
     kept_bytes = count * FLOATS_PER_GAUSSIAN * 4 * 3  # parameters and two moments
-    return _peak_bytes() - before - kept_bytes
+    return _process_bytes("VmHWM") - before - kept_bytes
 
 
-def _resident_bytes():
-    return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * resource.getpagesize()
-
-
-def _peak_bytes():
+def _process_bytes(name):
+    """A size from this process's status (proc(5))."""
     lines = Path("/proc/self/status").read_text("ascii").splitlines()
-    peak = next(line for line in lines if line.startswith("VmHWM"))
-    return int(peak.split()[1]) * 1024
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))

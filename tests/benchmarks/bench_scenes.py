@@ -1,7 +1,8 @@
 """Seeded scenes whose work is like a street's, at any size."""
 
 import torch
-from splat_drawing import pinhole
+
+from lidarpainter_models.geometry.cameras import Camera
 
 LEARNED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "camera_from_body")
 
@@ -32,15 +33,8 @@ def street_like_splats(count, width_px, height_px):
     }
     for name in LEARNED:
         splats[name].requires_grad_()
-    splats["camera"] = pinhole(
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
-    return splats
+    pose, size = torch.eye(4, dtype=torch.float64), {"width_px": width_px, "height_px": height_px}
+    return splats | {"camera": Camera.centred(pose, focal_px, **size)}
 
 
 def street_like_points(count, width_px, height_px):

@@ -1,7 +1,6 @@
 """Measure something in a process of its own, whose memory and compiled code are its alone."""
 
 import multiprocessing
-import resource
 from concurrent.futures import ProcessPoolExecutor
 
 
@@ -10,8 +9,3 @@ def in_own_process(measure, *arguments):
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
         return pool.submit(measure, *arguments).result()
-
-
-def peak_bytes():
-    """The largest resident memory of this process so far."""
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
