@@ -11,14 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import foxglove
 import numpy as np
+from foxglove import Channel, Context
+from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 
 from lidarpainter_models.geometry.timed_poses import poses_at
-from lidarpainter_models.geometry.transforms import (
-    invert_rigid,
-    quaternion_from_rotation,
-)
+from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 
 CAMERA, LIDAR = "cameras/{}/image/compressed", "lidars/{}/points"
 WORLD, CAR = "map", "base_link"
@@ -121,14 +121,13 @@ class BagScene:
         return sorted(found, key=lambda one: one[0])
 
 
-def packed(columns, *, big_endian=False):
+def packed(columns):
     """Points as the bytes of a cloud whose fields are `POINT_FIELDS` and x."""
     xyz_m, intensity, ring, offset_ns = columns
-    order = ">" if big_endian else "<"
     kind = np.dtype(
         {
             "names": ["intensity", "z", "y", "ring", "t", "x"],
-            "formats": [f"{order}{form}" for form in ("f4", "f4", "f4", "u2", "u4", "f4")],
+            "formats": ["<f4", "<f4", "<f4", "<u2", "<u4", "<f4"],
             "offsets": [0, 4, 8, 12, 14, 18],
             "itemsize": POINT_BYTES,
         }
@@ -200,36 +199,27 @@ class RosWriter:
         self._writer.add_message(self._channels[topic], log_ns, data, log_ns)
 
     def transform(self, time_ns, parent, child, pose):
-        w, x, y, z = quaternion_from_rotation(pose[:3, :3]).tolist()
-        place = dict(zip("xyz", pose[:3, 3].tolist(), strict=True))
-        return self.make(
-            "geometry_msgs/TransformStamped",
-            header=self.header(time_ns, parent),
-            child_frame_id=child,
-            transform=self.make(
-                "geometry_msgs/Transform",
-                translation=self.make("geometry_msgs/Vector3", **place),
-                rotation=self.make("geometry_msgs/Quaternion", w=w, x=x, y=y, z=z),
-            ),
+        place, turn = place_and_turn(pose)
+        moved = self.make(
+            "geometry_msgs/Transform",
+            translation=self.make("geometry_msgs/Vector3", **place),
+            rotation=self.make("geometry_msgs/Quaternion", **turn),
         )
+        header = self.header(time_ns, parent)
+        kind = "geometry_msgs/TransformStamped"
+        return self.make(kind, header=header, child_frame_id=child, transform=moved)
 
     def pose(self, pose):
-        w, x, y, z = quaternion_from_rotation(pose[:3, :3]).tolist()
-        place = dict(zip("xyz", pose[:3, 3].tolist(), strict=True))
+        place, turn = place_and_turn(pose)
         return self.make(
             "geometry_msgs/Pose",
             position=self.make("geometry_msgs/Point", **place),
-            orientation=self.make("geometry_msgs/Quaternion", w=w, x=x, y=y, z=z),
+            orientation=self.make("geometry_msgs/Quaternion", **turn),
         )
 
     def image(self, time_ns, frame, jpeg):
-        data = np.frombuffer(bytes(jpeg), np.uint8)
-        return self.make(
-            "sensor_msgs/CompressedImage",
-            header=self.header(time_ns, frame),
-            format="jpeg",
-            data=data,
-        )
+        header, data = self.header(time_ns, frame), np.frombuffer(bytes(jpeg), np.uint8)
+        return self.make("sensor_msgs/CompressedImage", header=header, format="jpeg", data=data)
 
     def lens(self, time_ns, frame, camera, distortion):
         k, p, terms = calibration(camera, distortion)
@@ -268,35 +258,21 @@ class RosWriter:
         )
 
     def detections(self, time_ns, boxes):
-        found = []
+        found, header = [], self.header(time_ns, WORLD)
         for _, track, pose in boxes:
             size_m = dict(zip("xyz", track.size_m.tolist(), strict=True))
-            hypothesis = self.make(
-                "vision_msgs/ObjectHypothesis", class_id=track.category, score=1.0
+            size, place = self.make("geometry_msgs/Vector3", **size_m), self.pose(pose)
+            kind = "geometry_msgs/PoseWithCovariance"
+            result = self.make(
+                "vision_msgs/ObjectHypothesisWithPose",
+                hypothesis=self.make(
+                    "vision_msgs/ObjectHypothesis", class_id=track.category, score=1.0
+                ),
+                pose=self.make(kind, pose=place, covariance=np.zeros(36)),
             )
-            spread = self.make(
-                "geometry_msgs/PoseWithCovariance", pose=self.pose(pose), covariance=np.zeros(36)
-            )
-            found.append(
-                self.make(
-                    "vision_msgs/Detection3D",
-                    header=self.header(time_ns, WORLD),
-                    results=[
-                        self.make(
-                            "vision_msgs/ObjectHypothesisWithPose",
-                            hypothesis=hypothesis,
-                            pose=spread,
-                        )
-                    ],
-                    bbox=self.make(
-                        "vision_msgs/BoundingBox3D",
-                        center=self.pose(pose),
-                        size=self.make("geometry_msgs/Vector3", **size_m),
-                    ),
-                    id=track.actor_id,
-                )
-            )
-        header = self.header(time_ns, WORLD)
+            box = self.make("vision_msgs/BoundingBox3D", center=place, size=size)
+            about = {"header": header, "results": [result], "bbox": box, "id": track.actor_id}
+            found.append(self.make("vision_msgs/Detection3D", **about))
         return self.make("vision_msgs/Detection3DArray", header=header, detections=found)
 
 
@@ -333,6 +309,13 @@ def _ros_messages(writer, bag, log_ns, kind, content):
         yield "detections", writer.detections(time_ns, boxes)
 
 
+def place_and_turn(pose):
+    """Of a pose: x, y, z, and those of the quaternion with w, by name."""
+    turn = quaternion_from_rotation(pose[:3, :3]).tolist()
+    place = pose[:3, 3].tolist()
+    return dict(zip("xyz", place, strict=True)), dict(zip("wxyz", turn, strict=True))
+
+
 def calibration(camera, distortion):
     """K, P and D of a calibration message; pixels count from the centre of the first."""
     fx, fy, cx, cy = camera.fx_px, camera.fy_px, camera.cx_px - 0.5, camera.cy_px - 0.5
@@ -343,28 +326,18 @@ def calibration(camera, distortion):
 
 def write_foxglove_bag(scene, file):
     """Write a scene as Foxglove's SDK does."""
-    import foxglove
-    from foxglove import Channel, Context
-
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     bag, context, channels = BagScene(scene), Context(), {}
     with foxglove.open_mcap(file, context=context):
         for log_ns, kind, content in bag.messages():
             for topic, message in _foxglove_messages(bag, log_ns, kind, content):
                 if topic not in channels:
-                    kind_of = type(message)
-                    channels[topic] = Channel(
-                        f"/{topic}",
-                        schema=kind_of.get_schema(),
-                        message_encoding="protobuf",
-                        context=context,
-                    )
+                    form = {"schema": message.get_schema(), "message_encoding": "protobuf"}
+                    channels[topic] = Channel(f"/{topic}", **form, context=context)
                 channels[topic].log(message.encode(), log_time=log_ns)
 
 
 def _foxglove_messages(bag, log_ns, kind, content):
-    from foxglove import messages as fox
-
     if kind == "mounts":
         found = [_frame_transform(0, *mount) for mount in bag.mounts()]
         yield "tf_static", fox.FrameTransforms(transforms=found)
@@ -424,12 +397,10 @@ def _foxglove_messages(bag, log_ns, kind, content):
 
 
 def _entity(time_ns, track, pose):
-    from foxglove import messages as fox
-
-    length_m, width_m, height_m = track.size_m.tolist()
+    place, turn = place_and_turn(pose)
     cube = fox.CubePrimitive(
-        pose=fox.Pose(position=_vector(pose), orientation=_quaternion(pose)),
-        size=fox.Vector3(x=length_m, y=width_m, z=height_m),
+        pose=fox.Pose(position=fox.Vector3(**place), orientation=fox.Quaternion(**turn)),
+        size=fox.Vector3(**dict(zip("xyz", track.size_m.tolist(), strict=True))),
         color=fox.Color(r=1, g=0, b=0, a=1),
     )
     return fox.SceneEntity(
@@ -442,31 +413,15 @@ def _entity(time_ns, track, pose):
 
 
 def _frame_transform(time_ns, parent, child, pose):
-    from foxglove import messages as fox
-
+    place, turn = place_and_turn(pose)
     return fox.FrameTransform(
         timestamp=_timestamp(time_ns),
         parent_frame_id=parent,
         child_frame_id=child,
-        translation=_vector(pose),
-        rotation=_quaternion(pose),
+        translation=fox.Vector3(**place),
+        rotation=fox.Quaternion(**turn),
     )
 
 
 def _timestamp(time_ns):
-    from foxglove import messages as fox
-
     return fox.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
-
-
-def _vector(pose):
-    from foxglove import messages as fox
-
-    return fox.Vector3(**dict(zip("xyz", pose[:3, 3].tolist(), strict=True)))
-
-
-def _quaternion(pose):
-    from foxglove import messages as fox
-
-    w, x, y, z = quaternion_from_rotation(pose[:3, :3]).tolist()
-    return fox.Quaternion(w=w, x=x, y=y, z=z)
