@@ -9,6 +9,7 @@ import pytest
 import torch
 from av2_log import CAMERAS
 from commands import refuse, succeed
+from drawn_streets import recorded_street
 from ncore.data import FrameTimepoint, ShutterType
 from ncore.data.v4 import SequenceComponentGroupsReader, SequenceLoaderV4
 from nuscenes_log import FAR_AWAY
@@ -20,12 +21,7 @@ from lidarpainter_models.geometry.transforms import invert_rigid, transform_poin
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Distortion
-from lidarpainter_models.synthetic import (
-    RigLidar,
-    SyntheticStreet,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigLidar
 
 NAME = "synthetic_street-0005"
 
@@ -41,17 +37,8 @@ def written(scene, folder, frames=None):
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     """Two cameras and a LiDAR that is called as a preset, far from the origin of their frame."""
-    config = SyntheticStreetConfig(
-        seed=5,
-        num_frames=3,
-        width_px=96,
-        height_px=54,
-        samples_per_axis=1,
-        cameras=CAMERAS,
-        lidar=RigLidar(name="pandar64", columns=360),
-    )
-    path = record_street(SyntheticStreet(config), tmp_path_factory.mktemp("street"))
-    scene = DrivingScene.open(path)
+    lidar = RigLidar(name="pandar64", columns=360)
+    scene = recorded_street(tmp_path_factory.mktemp("street"), CAMERAS, lidar=lidar)
     scene.manifest["global_from_world"] = FAR_AWAY.reshape(16).tolist()
     return scene
 

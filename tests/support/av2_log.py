@@ -7,12 +7,12 @@ Written from the devkit's description (av2, `datasets/sensor/README.md`), not fr
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 import torch
+from drawn_streets import recorded_street
 from nuscenes_log import FAR_AWAY
 
 from lidarpainter_models.geometry.timed_poses import poses_at
@@ -21,14 +21,7 @@ from lidarpainter_models.geometry.transforms import (
     quaternion_from_rotation,
     transform_points,
 )
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreet,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera
 
 LOG = "00a6ffc1-6ce9-3bc3-a060-6006e9893a1a"
 CAMERAS = (
@@ -38,18 +31,9 @@ CAMERAS = (
 HALF_TURN_NS = 50_000_000
 
 
-def street_like_av2(store, **settings):
+def street_like_av2(store):
     """A street seen by two cameras and one LiDAR of 64 beams, far from the city's origin."""
-    chosen: dict[str, Any] = {
-        "seed": 5,
-        "num_frames": 3,
-        "width_px": 96,
-        "height_px": 54,
-        "samples_per_axis": 1,
-        "lidar": RigLidar(beams=64, columns=360),
-    } | settings
-    config = SyntheticStreetConfig(cameras=CAMERAS, **chosen)
-    scene = DrivingScene.open(record_street(SyntheticStreet(config), store))
+    scene = recorded_street(store, CAMERAS, beams=64)
     scene.manifest["global_from_world"] = FAR_AWAY.reshape(16).tolist()
     return scene
 

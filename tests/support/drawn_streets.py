@@ -1,4 +1,4 @@
-"""Each synthetic street is drawn once for all workers of pytest: drawing one takes seconds.
+"""Small synthetic streets, each drawn once for all workers of pytest: drawing one takes seconds.
 
 A street is all in the settings of its world, so what one worker has drawn the others read from a
 file. `conftest` makes their folder and puts `kept_city` where streets are drawn.
@@ -11,7 +11,23 @@ import os
 import pickle
 from pathlib import Path
 
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import RigLidar, SyntheticStreetConfig, write_street
 from lidarpainter_models.synthetic.world.city import build_city
+
+
+def recorded_street(store, cameras, *, beams=32, **settings):
+    """A small street as these cameras and one LiDAR record it."""
+    small = {
+        "seed": 5,
+        "num_frames": 3,
+        "width_px": 96,
+        "height_px": 54,
+        "samples_per_axis": 1,
+        "lidar": RigLidar(beams=beams, columns=360),
+    }
+    config = SyntheticStreetConfig(cameras=cameras, **(small | settings))
+    return DrivingScene.open(write_street(config, store))
 
 
 def kept_city(**world):

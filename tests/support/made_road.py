@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 import torch
+from gaussian_world import bare_points
 
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.lidar.ground_surface import ground_surface
-from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.lidar.road_lanes import driven_line, driven_road_lanes
 from lidarpainter_models.lidar.surroundings import Surroundings
 from lidarpainter_models.scenes.tracks import ActorTrack
@@ -66,13 +66,7 @@ def road_points(count, *, curvature_per_m=0.0, seed=0, noise_m=0.01, below_car=T
 
 def map_points(xyz_m):
     """Points as a LiDAR map has them."""
-    times = torch.zeros(len(xyz_m), dtype=torch.int64)
-    return MapPoints.uncoloured(
-        xyz_m=torch.from_numpy(xyz_m).float(),
-        frame_index=times,
-        timestamp_ns=times,
-        range_m=torch.ones(len(xyz_m)),
-    )
+    return bare_points(torch.from_numpy(xyz_m).float())
 
 
 def marking_places(lines, curvature_per_m=0.0, seed=1):

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from drawn_streets import recorded_street
 
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
@@ -27,14 +28,7 @@ from lidarpainter_models.geometry.transforms import (
     rotation_from_vector,
     transform_points,
 )
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreet,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera
 
 HALF_TURN_US = 25_000
 SCENE_NAME = "scene-0061"
@@ -70,19 +64,10 @@ FAR_AWAY = rigid_from_rotation(
 """`global_from_world` with a heading, a slope and a place of its own."""
 
 
-def street_like_nuscenes(store, *, global_from_world=FAR_AWAY, **settings):
+def street_like_nuscenes(store):
     """A street seen by six cameras and a LiDAR of 20 Hz, its boxes at the moments they are seen."""
-    chosen: dict[str, Any] = {
-        "seed": 5,
-        "num_frames": 7,
-        "width_px": 96,
-        "height_px": 54,
-        "samples_per_axis": 1,
-        "lidar": RigLidar(beams=32, columns=360),
-    } | settings
-    config = SyntheticStreetConfig(frame_interval_s=0.05, cameras=CAMERAS, **chosen)
-    scene = DrivingScene.open(record_street(SyntheticStreet(config), store))
-    scene.manifest["global_from_world"] = global_from_world.reshape(16).tolist()
+    scene = recorded_street(store, CAMERAS, num_frames=7, frame_interval_s=0.05)
+    scene.manifest["global_from_world"] = FAR_AWAY.reshape(16).tolist()
     scene.tracks = tuple(_when_seen(track, scene) for track in scene.tracks)
     return scene
 

@@ -7,7 +7,6 @@ was made. The messages are also read here without the reader's schema, to check 
 the other.
 """
 
-import struct
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,16 +93,6 @@ def write_overlay(frame_path, image_path, *, width_px=1280):
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), quality)[1]
     image_path.write_bytes(jpeg.tobytes())
-
-
-def record_content(path, index=0):
-    """The content of a record, found by the lengths alone."""
-    content, position = path.read_bytes(), 0
-    for _ in range(index + 1):
-        (num_bytes,) = struct.unpack_from("<Q", content, position)
-        start = position + 12
-        position = start + num_bytes + 4
-    return content[start : start + num_bytes]
 
 
 def fields(content):

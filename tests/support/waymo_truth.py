@@ -167,6 +167,15 @@ def write_truth(
     return truth
 
 
+def write_tiny_truth(folder):
+    """Two frames and two cameras, quick to write and to read."""
+    config = street_config(num_frames=2, width_px=32, height_px=24)
+    cameras = tuple(rig for rig in config.cameras if rig.name in ("FRONT", "SIDE_LEFT"))
+    lidar = RigLidar(name="TOP", beams=32, columns=360, up_m=2.18)
+    street = SyntheticStreet(replace(config, cameras=cameras, lidar=lidar))
+    return write_truth(street, folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0)
+
+
 def moved(pose, velocity, turn, seconds):
     """A pose a moment later."""
     later = pose.clone()

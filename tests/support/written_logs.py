@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from av2_log import LOG, street_like_av2, write_av2_log
 from bag_log import write_foxglove_bag, write_ros_bag
+from drawn_streets import recorded_street
 from kitti_log import DRIVE, SEQUENCE, write_kitti_raw, write_kitti_tracking
 from ncore_log import SEQUENCE as NCORE_SEQUENCE
 from ncore_log import write_ncore_log
@@ -19,18 +20,12 @@ from small_pandaset import PandasetFolder
 from waymo_components import write_v2
 from waymo_numbers import SEGMENT
 from waymo_records import write_v1
-from waymo_truth import street_config, write_truth
+from waymo_truth import write_tiny_truth
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import (
-    RigCamera,
-    RigLidar,
-    SyntheticStreet,
-    SyntheticStreetConfig,
-    record_street,
-)
+from lidarpainter_models.synthetic import RigCamera
 
 
 @dataclass(frozen=True)
@@ -101,16 +96,7 @@ def _street_like_kitti(folder: Path) -> DrivingScene:
         RigCamera(name=f"image_0{number}", focal_per_width=0.6, left_m=left_m)
         for number, left_m in ((2, 0.06), (3, -0.48))
     )
-    config = SyntheticStreetConfig(
-        seed=5,
-        num_frames=3,
-        width_px=96,
-        height_px=54,
-        samples_per_axis=1,
-        cameras=cameras,
-        lidar=RigLidar(beams=32, columns=360),
-    )
-    return DrivingScene.open(record_street(SyntheticStreet(config), folder / "street"))
+    return recorded_street(folder / "street", cameras)
 
 
 def _bag(folder: Path, write: Callable[..., object]) -> WrittenLog:
@@ -141,18 +127,7 @@ def _nuscenes(folder: Path) -> WrittenLog:
 
 
 def _waymo(folder: Path, write: Callable[..., object]) -> WrittenLog:
-    config = street_config(
-        num_frames=2,
-        width_px=32,
-        height_px=24,
-        cameras=tuple(rig for rig in street_config().cameras if rig.name in ("FRONT", "SIDE_LEFT")),
-        lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
-    )
-    street = SyntheticStreet(config)
-    truth = write_truth(
-        street, folder / "truth", near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
-    )
-    write(truth, folder / "waymo")
+    write(write_tiny_truth(folder / "truth"), folder / "waymo")
     return WrittenLog("waymo", folder / "waymo", SEGMENT)
 
 

@@ -8,11 +8,11 @@ from waymo_components import write_v2
 from waymo_edits import FILE, refused_line
 from waymo_numbers import SEGMENT
 from waymo_records import frame_messages, tfrecord, write_v1
-from waymo_truth import WaymoTruth, street_config, write_truth
+from waymo_truth import WaymoTruth, street_config, write_tiny_truth, write_truth
 
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import RigLidar, SyntheticStreet
+from lidarpainter_models.synthetic import SyntheticStreet
 
 RELEASES = {"v1": write_v1, "v2": write_v2}
 
@@ -39,19 +39,8 @@ def truth(street, tmp_path_factory) -> WaymoTruth:
 
 
 @pytest.fixture(scope="session")
-def tiny_truth(street, tmp_path_factory) -> WaymoTruth:
-    """Two frames and two cameras, quick to write and to read."""
-    config = street_config(
-        num_frames=2,
-        width_px=32,
-        height_px=24,
-        cameras=tuple(rig for rig in street.config.cameras if rig.name in ("FRONT", "SIDE_LEFT")),
-        lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
-    )
-    folder = tmp_path_factory.mktemp("tiny-truth")
-    return write_truth(
-        SyntheticStreet(config), folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
-    )
+def tiny_truth(tmp_path_factory) -> WaymoTruth:
+    return write_tiny_truth(tmp_path_factory.mktemp("tiny-truth"))
 
 
 @pytest.fixture(scope="session")

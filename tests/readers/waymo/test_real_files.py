@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from waymo_real import RealFrame, all_of, fields, record_content, write_overlay
+from waymo_edits import records_in
+from waymo_real import RealFrame, all_of, fields, write_overlay
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import box_corners
@@ -75,7 +76,7 @@ def test_cameras_follow_the_lidar_around_the_car(real):
 
 def test_boxes_project_onto_the_datasets_own_rectangles(real, folder):
     """The file holds the labels as its makers projected them, with their camera model."""
-    content = record_content(folder / f"{FRAME}.tfrecord")
+    content, *_ = records_in((folder / f"{FRAME}.tfrecord").read_bytes())
     labels = {label.actor_id: label for label in real.frame.labels}
     tracks = {track.actor_id: track for track in real.tracks()}
     gaps_px = []
