@@ -1,4 +1,4 @@
-"""`lidarpainter export` and the views of `render`, on the tiny street with two cameras."""
+"""`export`, the views of `render`, and `view`, on the tiny street with two cameras."""
 
 import json
 from pathlib import Path
@@ -10,6 +10,7 @@ from commands import call, seen_image, succeed
 from plyfile import PlyData
 from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SIDE, WIDTH_PX
 
+from flows import interruption
 from lidarpainter_models.geometry.transforms import invert_rigid
 from tasks.opened import open_scene
 
@@ -136,3 +137,44 @@ def test_frames_are_numbered_as_recorded(tiny_run, tmp_path):
     made = succeed("export", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
     (file,) = Path(made["path"]).rglob("*.pcd.bin")
     assert file.name == f"{NUM_FRAMES - 1:04d}.pcd.bin"
+
+
+def test_page_is_one_file_that_names_the_scene(tiny_run, tmp_path):
+    out = tmp_path / "drive.html"
+    answer = succeed(
+        "export", "latest", "--format", "page", "--out", out, "--json", store=tiny_run.store
+    )
+    page = out.read_text("utf-8")
+    assert answer.json["path"] == str(out)
+    assert answer.json["bytes"] == len(page) < 3_000_000
+    assert f"<title>LidarPainter: {tiny_run.result['scene']}</title>" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--postpaint",), "a browser shows the scene itself"),
+        (("--trajectory", "lateral:90"), "lateral:90"),
+        (("--camera", "rear"), "rear"),
+    ],
+)
+def test_page_that_cannot_be_is_one_line(tiny_run, tmp_path, words, expected):
+    out = tmp_path / "drive.html"
+    asked = ("export", tiny_run.run_id, "--format", "page", "--out", out, *words)
+    answer = call(*asked, store=tiny_run.store)
+    assert answer.code == 2
+    assert expected in answer.err
+    assert answer.err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_view_says_where_it_is_and_opens_a_browser_there(tiny_run, monkeypatch):
+    from lidarpainter_models.viewing.viewer import LiveViewer
+
+    visited = []
+    monkeypatch.setattr(LiveViewer, "play", lambda *_: None)  # else it plays until Ctrl-C
+    monkeypatch.setattr("webbrowser.open", visited.append)
+    answer = succeed("view", "latest", store=tiny_run.store)
+    assert answer.out.startswith("http://127.0.0.1:")
+    assert answer.out.splitlines() == visited
+    assert interruption.message() == "closed"  # what Ctrl-C says from then on

@@ -1,4 +1,7 @@
-"""The tutorial and the notebook, followed word for word on a recording that takes seconds."""
+"""Pages show commands and options that there are, and are followed word for word.
+
+The tutorial and the notebook on a recording that takes seconds.
+"""
 
 import json
 import re
@@ -10,12 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 from commands import call
 
 import lidarpainter_models as lp
+from flows.cli.main import GLOBAL_OPTIONS, app
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md")])
+TOP = typer.main.get_command(app)
 SMALL = (
     *("--set", "observation.width_px=96", "--set", "rounds=1", "--set", "fit.steps=30"),
     *("--set", "refine.steps=10", "--set", 'novel.shifts=[{"lateral_m": 2}]'),
@@ -26,10 +33,40 @@ SET_UP = ("git", "make", ".")
 
 
 def commands_of(page):
-    """Every command of a page's shell blocks, comments left out."""
+    """Every command of a page's shell blocks; a trailing backslash joins lines."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-    lines = [line for block in blocks for line in block.splitlines()]
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def shown_commands(page):
+    """The words after `lidarpainter` in a page."""
+    return [words[1:] for words in commands_of(page) if words[0].endswith("lidarpainter")]
+
+
+def unknown_words(words):
+    """What of a command's words there is not."""
+    words = list(words)
+    while words and words[0] in GLOBAL_OPTIONS:
+        del words[:2]
+    group = TOP
+    while words and hasattr(group, "commands"):
+        if words[0] not in group.commands:
+            return [words[0]]
+        group = group.commands[words.pop(0)]
+    known = {name for one in group.params for name in (*one.opts, *one.secondary_opts)}
+    options = {word.partition("=")[0] for word in words if word.startswith("--")}
+    return sorted(options - known - {"--help"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_are_there(page):
+    found = {" ".join(words): unknown_words(words) for words in shown_commands(page)}
+    assert {words: unknown for words, unknown in found.items() if unknown} == {}
+
+
+def test_pages_show_commands():
+    assert sum(len(shown_commands(page)) for page in PAGES) > 40
 
 
 @pytest.mark.slow
