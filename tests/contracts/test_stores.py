@@ -127,10 +127,14 @@ def test_one_process_at_a_time_holds_a_lease(store, tmp_path):
 
 
 def test_a_run_is_running_while_somebody_works_on_it(store):
-    store.tables.merge("runs", [{"run_id": "r1", "status": "running"}])
+    ended = {"run_id": "r0", "status": "complete"}
+    store.tables.merge("runs", [{"run_id": "r1", "status": "running"}, ended])
+    assert store.run("r1")["status"] == "interrupted"
     with store.run_lock("r1"), store.run_lock("r1"):
         assert store.row("runs", "r1")["status"] == "running"
-    assert [row["status"] for row in store.rows("runs")] == ["interrupted"]
+        assert sorted(row["status"] for row in store.rows("runs")) == ["complete", "running"]
+    assert sorted(row["status"] for row in store.rows("runs")) == ["complete", "interrupted"]
+    assert store.row("runs", "r1")["status"] == "interrupted"
 
 
 def test_a_store_in_which_nothing_is_stored_is_none(store, monkeypatch):

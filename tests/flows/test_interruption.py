@@ -108,16 +108,6 @@ def statuses(store):
     return sorted(row["status"] for row in store.tables.rows("runs"))
 
 
-def test_a_run_that_was_killed_does_not_count_as_running(store):
-    row = store.tables.rows("runs")[0]
-    store.tables.merge("runs", [{**row, "status": "running"}])
-    assert store.run(row["run_id"])["status"] == "interrupted"
-    with store.run_lock(row["run_id"]), store.run_lock(row["run_id"]):
-        assert [found["status"] for found in store.rows("runs")].count("running") == 1
-    assert all(found["status"] != "running" for found in store.rows("runs"))
-    assert store.row("runs", row["run_id"])["status"] == "interrupted"
-
-
 ENTERS_FOR_EVER = """
 import sys, time
 from flows import interruption
