@@ -27,10 +27,13 @@ def test_threads_follow_the_usable_cores():
 
 
 @pytest.mark.usefixtures("bare_environment")
-def test_thread_count_of_the_user_stays():
-    os.environ["NUMBA_NUM_THREADS"] = "7"
+def test_what_the_user_set_stays():
+    own = {"NUMBA_NUM_THREADS": "7", "OMP_WAIT_POLICY": "active", "PREFECT_LOGGING_LEVEL": "DEBUG"}
+    os.environ.update(own)
+    os.environ.pop("DO_NOT_TRACK", None)
     prepare_environment()
-    assert os.environ["NUMBA_NUM_THREADS"] == "7"
+    assert {name: os.environ[name] for name in own} == own
+    assert os.environ["DO_NOT_TRACK"] == "1"
 
 
 @pytest.mark.usefixtures("bare_environment")

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from flows.environment import prepare_environment
-
 PROXIES = dict.fromkeys(("http_proxy", "https_proxy", "all_proxy"), "http://127.0.0.1:9")
 ROOT = Path(__file__).resolve().parents[2]
 FLOW = """
@@ -82,13 +80,3 @@ def test_a_killed_flow_leaves_no_server_behind(tmp_path):
     while answers(api):
         assert time.monotonic() < deadline
         time.sleep(0.1)
-
-
-def test_what_the_user_set_stays(monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    monkeypatch.delenv("DO_NOT_TRACK", raising=False)
-    monkeypatch.setenv("PREFECT_LOGGING_LEVEL", "DEBUG")
-    prepare_environment()
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
-    assert os.environ["PREFECT_LOGGING_LEVEL"] == "DEBUG"
-    assert os.environ["DO_NOT_TRACK"] == "1"
