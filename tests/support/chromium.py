@@ -11,7 +11,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from waiting import until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 WORDS = ("--headless=new", "--no-sandbox", "--hide-scrollbars", "--remote-debugging-port=0")
@@ -102,12 +102,3 @@ class Chromium:
         """Addresses of everything that was asked for."""
         found = [event for event in self.events if event["method"] == "Network.requestWillBeSent"]
         return [event["params"]["request"]["url"] for event in found]
-
-
-def until(holds, *, seconds=60.0):
-    """Wait for something that will hold."""
-    end = time.monotonic() + seconds
-    while not (found := holds()):
-        assert time.monotonic() < end, "it never came"
-        time.sleep(0.1)
-    return found
