@@ -5,9 +5,9 @@ import random
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import grpc
+import psutil
 import pytest
 from served_process import serving
 from spoilt_messages import lenses, spoilt
@@ -89,12 +89,6 @@ def ask(address, seed, until, requests, expected):
     return counts
 
 
-def resident_bytes(process):
-    lines = Path(f"/proc/{process.pid}/status").read_text("ascii").splitlines()
-    (line,) = (one for one in lines if one.startswith("VmRSS"))
-    return 1024 * int(line.split()[1])
-
-
 @pytest.mark.slow
 def test_eight_clients_get_what_one_gets_and_the_server_does_not_grow(tiny_run):
     words = ("--time-limit", "300s", "--placeholder", "--parked-apart")
@@ -110,9 +104,9 @@ def test_eight_clients_get_what_one_gets_and_the_server_does_not_grow(tiny_run):
                 for seed in range(CLIENTS)
             ]
             time.sleep(WARM_SHARE * SECONDS)
-            first = resident_bytes(process)
+            first = psutil.Process(process.pid).memory_info().rss
             counts = [one.result() for one in asking]
-        last = resident_bytes(process)
+        last = psutil.Process(process.pid).memory_info().rss
         answered, refused = map(sum, zip(*counts, strict=True))
         print(f"{answered} answered, {refused} refused, {first / 1e6:.0f} to {last / 1e6:.0f} MB")  # noqa: T201
         assert answered > CLIENTS
