@@ -24,15 +24,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 from bucket_stand_in import BUCKET, running_stand_in  # noqa: E402
 from chaos import Chaos, Site  # noqa: E402
 from production_services import NO_POSTGRES  # noqa: E402
-from stub_fleet import stub_ledger, write_stub_manifest  # noqa: E402
+from stub_fleet import asked_ledger, stub_ledger, write_stub_manifest  # noqa: E402
 from stub_stages import make, stages_ledger, write_inputs  # noqa: E402
 
 from catalog.artefacts import ArtefactRef  # noqa: E402
 from catalog.digests import digest_file  # noqa: E402
 from catalog.store import open_store  # noqa: E402
-from flows.fleet.asked_sequences import wishes  # noqa: E402
 from flows.fleet.flow_runs import close_lost_runs  # noqa: E402
-from flows.fleet.manifest import read_manifest  # noqa: E402
 from flows.fleet.status import fleet_status  # noqa: E402
 from flows.fleet.worker import Worker  # noqa: E402
 
@@ -177,9 +175,7 @@ def settled(site: Site) -> list[str]:
 def undisturbed(folder: Path, manifest: Path) -> Path:
     """The same fleet in a store of its own, one sequence after the other."""
     os.environ.update({"STUB_INPUTS": str(folder / "inputs"), "STUB_PACE_S": "0"})
-    ledger = stub_ledger(folder / "undisturbed")
-    ledger.store.make()
-    ledger.ask(wishes(read_manifest(manifest), folder))
+    ledger = asked_ledger(folder / "undisturbed", manifest)
     Worker(
         ledger=ledger,
         fleet=NAME,

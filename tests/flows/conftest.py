@@ -45,6 +45,15 @@ def prefect_api(tmp_path_factory):
             yield
 
 
+@pytest.fixture
+def client(prefect_api):  # noqa: ARG001 - the server
+    """A client of that server."""
+    from prefect.client.orchestration import get_client
+
+    with get_client(sync_client=True) as found:
+        yield found
+
+
 @pytest.fixture(scope="package")
 def tiny_run(
     prefect_api: None,  # noqa: ARG001 - flows find it where Prefect looks

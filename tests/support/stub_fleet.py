@@ -8,7 +8,9 @@ from pathlib import Path
 from catalog.fleets import FleetLedger
 from catalog.leases import Leases
 from catalog.store import open_store
+from flows.fleet.asked_sequences import wishes
 from flows.fleet.local_workers import log_path
+from flows.fleet.manifest import read_manifest
 from lidarpainter_models.errors import DataError
 
 SCRIPT = Path(__file__)
@@ -38,6 +40,14 @@ def stub_ledger(root, **options):
     store = open_store(root)
     leases = Leases(store.objects("leases"), time_to_live_s=TIME_TO_LIVE_S)
     return FleetLedger(store, leases=leases, first_pause_s=0.0, **options)
+
+
+def asked_ledger(root, manifest):
+    """The ledger of a store, made if need be, of which a manifest was asked."""
+    ledger = stub_ledger(root)
+    ledger.store.make()
+    ledger.ask(wishes(read_manifest(manifest), manifest.parent))
+    return ledger
 
 
 def behave(root, scene, what):

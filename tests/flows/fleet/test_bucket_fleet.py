@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from small_pandaset import PandasetFolder
-from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
+from stub_fleet import asked_ledger, stub_ledger, stub_worker, write_stub_manifest
 
 from catalog import buckets
 from catalog.buckets import Bucket
@@ -27,11 +27,7 @@ def impatient(monkeypatch):
 
 @pytest.fixture
 def asked(address, tmp_path):
-    path = write_stub_manifest(tmp_path, sequences=2)
-    ledger = stub_ledger(address)
-    ledger.store.make()
-    ledger.ask(wishes(read_manifest(path), path.parent))
-    return ledger
+    return asked_ledger(address, write_stub_manifest(tmp_path, sequences=2))
 
 
 def test_a_log_in_a_bucket_is_fetched_read_and_let_go(address, tmp_path, monkeypatch):

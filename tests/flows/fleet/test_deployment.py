@@ -1,6 +1,7 @@
 """A fleet in Prefect's hands: what is deployed, what is refused, and that it fires by itself."""
 
-import time
+import inspect
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -10,24 +11,27 @@ from commands import call
 from production_services import NO_POSTGRES
 from stub_fleet import stub_ledger, write_stub_manifest
 from stub_stages import write_inputs
+from waiting import until
 
 from flows.fleet.deployed import deploy
 from lidarpainter_models.errors import ConfigError
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples" / "deploy"
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLES = ROOT / "docs" / "examples" / "deploy"
+DEPLOYED = yaml.safe_load((ROOT / "prefect.yaml").read_text("utf-8"))["deployments"]
 LONGEST_S = 600.0
-
-
-@pytest.fixture
-def client(prefect_api):  # noqa: ARG001 - the server
-    from prefect.client.orchestration import get_client
-
-    with get_client(sync_client=True) as found:
-        yield found
 
 
 def parameters(store, workers=2):
     return {"manifest": "/logs/night.toml", "store": str(store), "workers": workers}
+
+
+@pytest.mark.parametrize("deployment", DEPLOYED, ids=lambda deployment: deployment["name"])
+def test_what_the_project_deploys_names_a_flow_and_its_parameters(deployment):
+    path, _, name = deployment["entrypoint"].partition(":")
+    flow = getattr(import_module(path.removesuffix(".py").replace("/", ".")), name)
+    known = inspect.signature(flow.fn).parameters
+    assert set(deployment.get("parameters", {})) <= set(known)
 
 
 def test_a_fleet_is_deployed_once_and_changed_by_doing_it_again(client, tmp_path):
@@ -114,17 +118,10 @@ def test_a_schedule_fires_by_itself_and_makes_only_what_is_new(tmp_path):
     ) as site:
         site.deploy(manifest, every_s=30)
         site.start_process_workers()
-        _until(lambda: site.status()["done"] == 2)
+        until(lambda: site.status()["done"] == 2, seconds=LONGEST_S)
         first = stub_ledger(site.store).store.tables.rows("attempts")
         write_stub_manifest(tmp_path, "twice", sequences=3)
-        _until(lambda: site.status()["done"] == 3)
+        until(lambda: site.status()["done"] == 3, seconds=LONGEST_S)
     attempts = stub_ledger(site.store).store.tables.rows("attempts")
     new = [row["scene_id"] for row in attempts if row not in first]
     assert (len(first), new) == (2, [scenes[2]])
-
-
-def _until(happens):
-    deadline = time.monotonic() + LONGEST_S
-    while not happens():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(1.0)

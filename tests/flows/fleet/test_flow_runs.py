@@ -4,12 +4,12 @@ import urllib.error
 
 import httpx
 import pytest
-from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
+from stub_fleet import asked_ledger, stub_ledger, stub_worker, write_stub_manifest
 
 from catalog.leases import FolderObjects, Leases
 from catalog.retries import attempt_id
 from flows.fleet import flow_runs as flow_runs_module
-from flows.fleet.asked_sequences import Asked, wishes
+from flows.fleet.asked_sequences import Asked
 from flows.fleet.flow_runs import (
     SEQUENCE,
     WORK,
@@ -19,20 +19,11 @@ from flows.fleet.flow_runs import (
     is_of_lost_api,
     store_tag,
 )
-from flows.fleet.manifest import read_manifest
 from flows.fleet.work import Made, make_sequence
 from lidarpainter_models.errors import SceneError
 
 ASKED = Asked(dataset="synthetic", sequence="street-0007", seed=7, preset="preview")
 MADE = Made(run_id="run", is_whole=False, num_bytes=0)
-
-
-@pytest.fixture
-def client(prefect_api):  # noqa: ARG001 - the server
-    from prefect.client.orchestration import get_client
-
-    with get_client(sync_client=True) as found:
-        yield found
 
 
 @pytest.fixture
@@ -162,9 +153,7 @@ def test_a_lost_api_is_known_by_its_errors():
 def test_a_lost_api_pauses_the_fleet_and_costs_no_tries(tmp_path, monkeypatch):
     """The API goes as the first sequence begins, and comes back after two looks."""
     path = write_stub_manifest(tmp_path, sequences=2)
-    ledger = stub_ledger(tmp_path / "store")
-    ledger.store.make()
-    ledger.ask(wishes(read_manifest(path), tmp_path))
+    ledger = asked_ledger(tmp_path / "store", path)
     lines, begun, away = [], [], [0]
     worker = stub_worker(ledger.store.root, "stub", say=lines.append)
     work = worker.work

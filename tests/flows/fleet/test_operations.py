@@ -6,13 +6,10 @@ import re
 import pytest
 from commands import refuse, succeed
 from prometheus_client.parser import text_string_to_metric_families
-from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
+from stub_fleet import asked_ledger, behave, stub_worker, write_stub_manifest
 
 from catalog.records import metric_row
 from catalog.retries import Ending
-from catalog.store import open_store
-from flows.fleet.asked_sequences import wishes
-from flows.fleet.manifest import read_manifest
 from flows.fleet.report import fleet_page
 from flows.fleet.worker import EventLog
 from lidarpainter_models.export.report import render_report
@@ -27,11 +24,8 @@ MOST_BYTES = 5_000_000
 def worked(tmp_path_factory):
     """A fleet of four streets of which one was set aside, its store, and what its worker logged."""
     folder = tmp_path_factory.mktemp("fleet")
-    store = open_store(folder / "store")
-    store.make()
-    path = write_stub_manifest(folder, more=MONEY)
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), path.parent))
+    ledger = asked_ledger(folder / "store", write_stub_manifest(folder, more=MONEY))
+    store = ledger.store
     behave(store.root, STREETS[1], "bad")
     lines = []
     stub_worker(store.root, "stub", say=EventLog("stub", lines.append)).run()
@@ -127,11 +121,8 @@ def test_the_page_says_what_happened_and_stands_alone(worked, tmp_path):
 
 
 def test_an_attempt_that_older_code_left_without_a_cause_is_told_as_unknown(tmp_path):
-    store = open_store(tmp_path / "store")
-    store.make()
-    path = write_stub_manifest(tmp_path)
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), path.parent))
+    ledger = asked_ledger(tmp_path / "store", write_stub_manifest(tmp_path))
+    store = ledger.store
     (row,) = [row for row in ledger.rows("stub") if row["scene_id"] == STREETS[0]]
     ledger.end(ledger.take(row, {}), Ending(cause="error", seconds=2.0))
     (attempt,) = store.tables.rows("attempts")
@@ -146,10 +137,7 @@ def test_an_attempt_that_older_code_left_without_a_cause_is_told_as_unknown(tmp_
 
 
 def test_a_fleet_that_nobody_has_begun_has_a_page_and_an_unknown_one_has_none(tmp_path):
-    store = open_store(tmp_path / "store")
-    store.make()
-    path = write_stub_manifest(tmp_path)
-    stub_ledger(store.root).ask(wishes(read_manifest(path), path.parent))
+    store = asked_ledger(tmp_path / "store", write_stub_manifest(tmp_path)).store
     out = tmp_path / "night.html"
     succeed("fleet", "report", "--out", out, store=store)
     assert "Nobody has begun." in out.read_text("utf-8")

@@ -3,7 +3,6 @@
 import gc
 import shutil
 import signal
-import time
 import weakref
 from types import SimpleNamespace
 
@@ -11,14 +10,15 @@ import pytest
 from commands import call
 from small_pandaset import PandasetFolder
 from stub_fleet import (
+    asked_ledger,
     behave,
-    stub_ledger,
     stub_starter,
     stub_work,
     stub_worker,
     write_stub_manifest,
 )
 from toy_store import write_toy_scene
+from waiting import until
 
 from catalog.errors import DamagedArtefactError, StorageError
 from catalog.fleets import FleetLedger
@@ -48,10 +48,7 @@ def store(tmp_path):
 @pytest.fixture
 def asked(store, tmp_path):
     """A ledger in which a manifest of four streets was asked for."""
-    path = write_stub_manifest(tmp_path)
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), path.parent))
-    return ledger
+    return asked_ledger(store.root, write_stub_manifest(tmp_path))
 
 
 def states(ledger):
@@ -62,14 +59,6 @@ def causes(ledger, scene):
     rows = ledger.store.tables.rows("attempts")
     found = [row for row in rows if row["scene_id"] == scene]
     return [row["cause"] for row in sorted(found, key=lambda row: row["started_at"])]
-
-
-def until(happens, timeout_s=60.0):
-    deadline = time.monotonic() + timeout_s
-    while not (found := happens()):
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
-    return found
 
 
 def test_a_worker_decides_by_the_cause(asked, store):
@@ -119,10 +108,7 @@ def test_a_corrupted_log_is_set_aside_with_its_reason(store, tmp_path, monkeypat
     path = tmp_path / "night.toml"
     text = '[[source]]\ndataset = "pandaset"\nroot = "logs"\n[budget]\nfree_disk_gb = 0\n'
     path.write_text(f'name = "stub"\n{text}')
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), tmp_path))
-    from flows.fleet.work import make_sequence
-
+    ledger = asked_ledger(store.root, path)
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     worker = stub_worker(store.root, "stub")
     worker.work = make_sequence
@@ -174,9 +160,7 @@ def test_an_end_that_finds_no_room_is_entered_once_there_is_some(asked, store, m
 
 
 def test_the_hours_of_a_budget_end_a_fleet(store, tmp_path):
-    path = write_stub_manifest(tmp_path, more="hours = 0.5\n")
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), path.parent))
+    ledger = asked_ledger(store.root, write_stub_manifest(tmp_path, more="hours = 0.5\n"))
     lease = ledger.take(ledger.rows("stub")[0], {})
     ledger.end(lease, Ending(cause="done", run_id="run", seconds=1900.0))
     stub_worker(store.root, "stub").run()
@@ -318,9 +302,7 @@ def asked_of_elsewhere(store, folder, fit_seeds="[0]"):
     source = '[[source]]\ndataset = "canonical"\nroot = "logs"\n'
     head = f'name = "stub"\npainter = "none"\nfit_seeds = {fit_seeds}\n'
     path.write_text(f"{head}{source}[budget]\nfree_disk_gb = 0\n")
-    ledger = stub_ledger(store.root)
-    ledger.ask(wishes(read_manifest(path), path.parent))
-    return ledger
+    return asked_ledger(store.root, path)
 
 
 def test_a_scene_from_elsewhere_is_made_under_its_own_name(store, tmp_path, monkeypatch):
