@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,11 @@ def relative(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
 def top_level_imports(tree: ast.Module) -> set[str]:
     names = set()
     for node in tree.body:
@@ -35,28 +41,22 @@ def top_level_imports(tree: ast.Module) -> set[str]:
     return names
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=relative)
-def test_module_is_short_documented_and_imports_heavy_things_late(path):
-    text = path.read_text("utf-8")
-    tree = ast.parse(text)
-    assert ast.get_docstring(tree), "a module says what it does"
-    assert len(text.splitlines()) <= MAX_LINES, "a reader cannot hold it in mind"
-    assert not top_level_imports(tree) & LAZY, "heavy packages are imported inside functions"
+def test_modules_are_short_documented_and_import_heavy_things_late():
+    for path in SOURCES:
+        text, tree = path.read_text("utf-8"), parsed(path)
+        assert ast.get_docstring(tree), f"{relative(path)} does not say what it does"
+        assert len(text.splitlines()) <= MAX_LINES, f"nobody can hold {relative(path)} in mind"
+        assert not top_level_imports(tree) & LAZY, f"{relative(path)} imports heavy things early"
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in SOURCES if not relative(path).startswith(COMPILED)], ids=relative
-)
-def test_no_function_is_longer_than_a_screen(path):
-    functions = [
-        node
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-    ]
+def test_no_function_is_longer_than_a_screen():
     long = {
-        node.name: lines
-        for node in functions
-        if (lines := node.end_lineno - first_line(node) + 1) > MAX_FUNCTION_LINES
+        f"{relative(path)}: {node.name}": lines
+        for path in SOURCES
+        if not relative(path).startswith(COMPILED)
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (lines := node.end_lineno - first_line(node) + 1) > MAX_FUNCTION_LINES
     }
     assert long == {}
 
