@@ -12,7 +12,7 @@ import torch
 from random_diffusion import empty_network
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
-from turbo_shapes import SD_TURBO, WholeModel, build_text_encoder
+from turbo_shapes import SD_TURBO, build_text_encoder
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
@@ -35,13 +35,13 @@ META = torch.device("meta")
 TERA = 1e12
 
 
-def count_parameters(config: OneStepConfig, architecture: WholeModel = SD_TURBO) -> dict[str, int]:
+def count_parameters(config: OneStepConfig) -> dict[str, int]:
     """Parameters of every part.
 
     `unet` and `autoencoder` are those of the model underneath; `first_layer_added` is what further
     inputs add to the U-Net's first layer.
     """
-    network = _shapes(config, architecture, has_adapters=True)
+    network = _shapes(config, has_adapters=True)
     counts = {name: parameter.numel() for name, parameter in network.named_parameters()}
 
     def total(prefix: str, *, adapters: bool) -> int:
@@ -59,7 +59,7 @@ def count_parameters(config: OneStepConfig, architecture: WholeModel = SD_TURBO)
     added = first[:, LATENT_CHANNELS:].numel()
     skips = total(SKIPS, adapters=False)
     with META:
-        text_encoder = build_text_encoder(architecture)
+        text_encoder = build_text_encoder(SD_TURBO)
     return {
         "unet": total("denoiser.", adapters=False) - added,
         "first_layer_added": added,
@@ -72,9 +72,7 @@ def count_parameters(config: OneStepConfig, architecture: WholeModel = SD_TURBO)
     }
 
 
-def count_tflop(
-    config: OneStepConfig, *, height_px: int, width_px: int, architecture: WholeModel = SD_TURBO
-) -> dict[str, float]:
+def count_tflop(config: OneStepConfig, *, height_px: int, width_px: int) -> dict[str, float]:
     """Arithmetic for one view in 10^12 operations, adapters merged; the text is encoded before.
 
     Raises:
@@ -82,10 +80,10 @@ def count_tflop(
     """
     if min(height_px, width_px) < 1:
         raise ConfigError(f"a view needs pixels, got {width_px}x{height_px}")
-    network = _shapes(config, architecture, has_adapters=False).to(META)  # buffers too
+    network = _shapes(config, has_adapters=False).to(META)  # buffers too
     rows, columns = (-(-size // STRIDE_PX) * STRIDE_PX // CELL_PX for size in (height_px, width_px))
     images = torch.empty(len(config.inputs), 1, 3, rows * CELL_PX, columns * CELL_PX, device=META)
-    text = torch.empty(1, TEXT_TOKENS, architecture.text_width, device=META)
+    text = torch.empty(1, TEXT_TOKENS, SD_TURBO.text_width, device=META)
     masks = torch.empty(1, 2, rows, columns, device=META) if config.masks else None
     seen = torch.empty(1, config.first_layer_channels, rows, columns, device=META)
     total = _tflop(lambda: network(images, text, masks))
@@ -99,18 +97,18 @@ def count_tflop(
     }
 
 
-def count_bytes(config: OneStepConfig, architecture: WholeModel = SD_TURBO) -> dict[str, int]:
+def count_bytes(config: OneStepConfig) -> dict[str, int]:
     """Bytes of the weights in bfloat16, and of the tensors in a weights file of ours.
 
     The file is counted with the prompts of all styles.
     """
-    merged = _shapes(config, architecture, has_adapters=False)
-    network = _shapes(config, architecture, has_adapters=True)
+    merged = _shapes(config, has_adapters=False)
+    network = _shapes(config, has_adapters=True)
     state = dict(network.named_parameters())
     trained = sum(
         state[name].numel() * stored_type(name).itemsize for name in trained_names(network)
     )
-    prompts = len(STYLE_TEXTS) * TEXT_TOKENS * architecture.text_width
+    prompts = len(STYLE_TEXTS) * TEXT_TOKENS * SD_TURBO.text_width
     two = torch.bfloat16.itemsize
     return {"weights": two * _num_parameters(merged), "trained_file": trained + two * prompts}
 
@@ -127,11 +125,9 @@ def describe_wiring(config: OneStepConfig, *, height_px: int, width_px: int) -> 
 
 
 @lru_cache(maxsize=8)
-def _shapes(
-    config: OneStepConfig, architecture: WholeModel, *, has_adapters: bool
-) -> OneStepNetwork:
+def _shapes(config: OneStepConfig, *, has_adapters: bool) -> OneStepNetwork:
     """A network without weights, kept because building a thousand layers takes a second."""
-    return empty_network(config, architecture=architecture, has_adapters=has_adapters)
+    return empty_network(config, has_adapters=has_adapters)
 
 
 def _fusion_tflop(network: OneStepNetwork, rows: int, columns: int) -> float:

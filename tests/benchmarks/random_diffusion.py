@@ -22,9 +22,7 @@ def random_network(
     Adapters are random too, so that merging them changes something.
     """
     with torch.device("meta"):
-        unet = build_unet(architecture, config.first_layer_channels)
-        build = build_vae if config.autoencoder == "sd" else build_tiny
-        autoencoder = build(architecture)
+        unet, autoencoder = _parts(config, architecture)
     for part in (unet, autoencoder):
         nn.Module.to(part, dtype).to_empty(device="cpu")
         fill_randomly(part, seed=seed)
@@ -36,12 +34,16 @@ def random_network(
     return network.requires_grad_(False)
 
 
-def empty_network(config, *, architecture=SD_TURBO, has_adapters=False):
+def empty_network(config, *, has_adapters=False):
     """A network on the meta device: shapes without weights, for counting."""
     with torch.device("meta"):
-        unet = build_unet(architecture, config.first_layer_channels)
-        build = build_vae if config.autoencoder == "sd" else build_tiny
-        return assemble(config, unet, build(architecture), has_adapters=has_adapters)
+        unet, autoencoder = _parts(config, SD_TURBO)
+        return assemble(config, unet, autoencoder, has_adapters=has_adapters)
+
+
+def _parts(config, architecture):
+    build = build_vae if config.autoencoder == "sd" else build_tiny
+    return build_unet(architecture, config.first_layer_channels), build(architecture)
 
 
 @torch.no_grad()
