@@ -31,8 +31,9 @@ import lidarpainter_models as lp
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.gaussians.fitting.config import EffortConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.rewriting import header_of
 from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.writer import SceneWriter
 from lidarpainter_models.stress.frames import read_frame
 from lidarpainter_models.stress.spoiling import write_frame
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigLidar
@@ -258,12 +259,7 @@ def _fitted(scene: DrivingScene) -> Outcome:
 
 
 def _rewritten(scene: DrivingScene, store: Path, name: str, changes: Sequence[Change]) -> Path:
-    header = SceneHeader(
-        licence="CC0",
-        global_from_world=scene.global_from_world,
-        semantic_classes=scene.semantic_classes,
-    )
-    with SceneWriter(store, "fuzz", name, header) as writer:
+    with SceneWriter(store, "fuzz", name, header_of(scene, {})) as writer:
         for frame_index in scene.frame_indices:
             frame = read_frame(scene, frame_index)
             for change in changes:

@@ -19,11 +19,11 @@ from lidarpainter_models.gaussians.fitting.config import EffortConfig
 from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.observations.own_body import own_bodies
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.frame_content import FrameContent
+from lidarpainter_models.scenes.rewriting import header_of, write_anew
 from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 from lidarpainter_models.stress.causes import cause_of
-from lidarpainter_models.stress.frames import read_frame
-from lidarpainter_models.stress.spoiling import spoilt_name, write_frame, write_spoilt
+from lidarpainter_models.stress.spoiling import spoilt_name, write_spoilt
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 FRONT = DEFAULT_CAMERAS[0]
@@ -74,22 +74,16 @@ def _street(folder: Path, config: lp.SyntheticStreetConfig) -> DrivingScene:
 
 def _untold(scene: DrivingScene, store: Path, name: str) -> DrivingScene:
     """The same log, with nothing said of how its cameras read their rows."""
-    path = store / "scenes" / "untold" / f"{name}-{scene.sequence}"
+    path = store / "scenes" / scene.dataset / f"{name}-{scene.sequence}"
     if not path.is_dir():
-        header = SceneHeader(
-            licence="CC0",
-            global_from_world=scene.global_from_world,
-            semantic_classes=scene.semantic_classes,
-        )
-        with SceneWriter(store, "untold", path.name, header) as writer:
-            for frame_index in scene.frame_indices:
-                frame = read_frame(scene, frame_index)
-                shots = (
-                    replace(one, record=replace(one.record, rolling_shutter=None))
-                    for one in frame.shots
-                )
-                write_frame(writer, replace(frame, shots=tuple(shots)))
+        write_anew(scene, store, path.name, header_of(scene, {}), _without_shutters, {})
     return lp.open_scene(path)
+
+
+def _without_shutters(content: FrameContent) -> FrameContent:
+    records = (replace(image.record, rolling_shutter=None) for image in content.images)
+    pairs = zip(content.images, records, strict=True)
+    return replace(content, images=[replace(image, record=record) for image, record in pairs])
 
 
 def _judged(words: str, scene: DrivingScene) -> float:
