@@ -44,6 +44,7 @@ def test_a_later_round_paints_farther_out(tiny_run):
     changes = settings("rounds=2", "novel.outwards_m=1")
     words = ("--painter", "warp", "--shift", "2", *changes, "--no-evaluate", "--no-report")
     result = reconstructed(tiny_run, *words, "--json").json
+    assert {"refine-1", "refine-2"} <= set(result["seconds"])
     for stage, names in (
         ("paint-1", ("left-2m", "right-2m")),
         ("paint-2", ("left-3m", "right-3m")),

@@ -11,11 +11,14 @@ from toy_store import TOY_SCENE, write_toy_scene
 from catalog.errors import CatalogError, ConflictError
 from catalog.points import Point
 from catalog.store import open_store
+from flows.cli import measure
 from flows.fleet.asked_sequences import wishes
 from flows.fleet.manifest import Manifest, Source
+from flows.measure import stress, sweep
 from flows.measure.chart import chart_of, sizes_of
 from flows.measure.configurations import chart_ways, size_factors
 from flows.measure.figures import LANES, qualities
+from flows.measure.stress import SEEDS_IN_DOUBT, Trial, in_doubt, stress_of
 from flows.measure.sweep import run_sweep, was_asked
 from flows.overrides import with_overrides
 from flows.presets import PRESETS, preview
@@ -47,6 +50,24 @@ def point(scene, configuration, seed, psnr, cpu_seconds, num_gaussians=80_000):
         cost=cost,
         metrics=metrics,
     )
+
+
+def painted_points(gains, seeds=range(1)):
+    """Points of scenes, painted and not: what painting gains each in dB, by its name."""
+    return [
+        point(scene, way, seed, 25.0 + (gain if way == "painted" else 0.0), 100)
+        for scene, gain in gains.items()
+        for way in ("painted", "unpainted")
+        for seed in seeds
+    ]
+
+
+def trials_of(cause, *levels):
+    """Trials of a cause on the first scene."""
+    return [
+        Trial(scene=SCENES[0], cause=cause, level=float(level), spoilt=f"stress/{cause}-{level}")
+        for level in levels
+    ]
 
 
 @pytest.fixture
@@ -166,20 +187,9 @@ def test_a_sweep_that_another_took_over_is_refused(tmp_path, monkeypatch, other,
 
 
 def test_stress_says_where_painting_hurts(tmp_path):
-    from flows.measure.stress import Trial, stress_of
-
-    scene, quality = SCENES[0], {"none": 2.0, "32": 1.5, "16": 0.8, "8": -0.4}
-    trials = [
-        Trial(scene=scene, cause="beams", level=float(level), spoilt=f"synthetic/spoilt-{level}")
-        for level in ("32", "16", "8")
-    ]
+    scene, trials = SCENES[0], trials_of("beams", "32", "16", "8")
     names = [scene, *(trial.spoilt for trial in trials)]
-    points = [
-        point(name, way, seed, 25.0 + (gain if way == "painted" else 0.0), 100)
-        for name, gain in zip(names, quality.values(), strict=True)
-        for way in ("painted", "unpainted")
-        for seed in range(2)
-    ]
+    points = painted_points(dict(zip(names, (2.0, 1.5, 0.8, -0.4), strict=True)), range(2))
     result = stress_of(points, trials, tmp_path)
     told = next(one for one in result["says"] if one.startswith("beams"))
     assert "gains +2.00 as recorded, -0.40 at 8 beams; halved at 16, hurts at 8" in told
@@ -201,32 +211,13 @@ def test_stress_says_where_painting_hurts(tmp_path):
 
 
 def test_levels_at_which_painting_seems_to_hurt_are_given_more_seeds():
-    from flows.measure.stress import SEEDS_IN_DOUBT, Trial, in_doubt
-
-    gains = {"8": -0.15, "4": -0.05, "1": -0.15}
-    seeds = {"8": 1, "4": 1, "1": SEEDS_IN_DOUBT}
-    trials = [
-        Trial(scene=SCENES[0], cause="beams", level=float(level), spoilt=f"stress/beams-{level}")
-        for level in gains
-    ]
-    points = [
-        point(f"stress/beams-{level}", way, seed, 25.0 + (gain if way == "painted" else 0.0), 100)
-        for level, gain in gains.items()
-        for way in ("painted", "unpainted")
-        for seed in range(seeds[level])
-    ]
-    assert in_doubt(points, trials) == ["stress/beams-8"]
+    gains = {"stress/beams-8": -0.15, "stress/beams-4": -0.05}
+    points = painted_points(gains)
+    points += painted_points({"stress/beams-1": -0.15}, range(SEEDS_IN_DOUBT))
+    assert in_doubt(points, trials_of("beams", "8", "4", "1")) == ["stress/beams-8"]
 
 
 def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatch):
-    from flows.cli import measure
-    from flows.measure import stress, sweep
-    from flows.measure.stress import Trial
-
-    trials = [
-        Trial(scene=SCENES[0], cause="beams", level=float(level), spoilt=f"stress/beams-{level}")
-        for level in ("8", "4")
-    ]
     gains = {SCENES[0]: 0.2, "stress/beams-8": -0.15, "stress/beams-4": 0.1}
     asked, shown = [], []
 
@@ -240,7 +231,7 @@ def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatc
         ]
 
     monkeypatch.setattr("catalog.store.existing_store", lambda: None)
-    monkeypatch.setattr(stress, "trials_of", lambda *_: trials)
+    monkeypatch.setattr(stress, "trials_of", lambda *_: trials_of("beams", "8", "4"))
     monkeypatch.setattr(stress, "spoil_scenes", lambda *_: None)
     monkeypatch.setattr(sweep, "was_asked", lambda *_: True)
     monkeypatch.setattr(sweep, "foretold", lambda *_: "nothing")
@@ -256,18 +247,13 @@ def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatc
 
 
 def test_stress_says_from_which_level_on_a_cause_is_noticed(tmp_path):
-    from flows.measure.stress import Trial, stress_of
-
     scene = SCENES[0]
     said = {
         "none": ("camera faults: left looks 0.3 degrees up.",),
         "10": ("camera faults: left looks 0.4 degrees up.",),
         "50": ("camera faults: left looks 0.3 degrees up; front is 48 ms late.",),
     }
-    trials = [
-        Trial(scene=scene, cause="clock", level=float(level), spoilt=f"stress/clock-{level}")
-        for level in ("10", "50")
-    ]
+    trials = trials_of("clock", "10", "50")
     names = [scene, *(trial.spoilt for trial in trials)]
     points = [
         replace(point(name, way, 0, 25.0, 100), suspicions=suspicions)
