@@ -15,7 +15,7 @@ import foxglove
 import numpy as np
 from foxglove import Channel, Context
 from foxglove import messages as fox
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from lidarpainter_models.geometry.timed_poses import poses_at
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
@@ -276,10 +276,10 @@ class RosWriter:
         return self.make("vision_msgs/Detection3DArray", header=header, detections=found)
 
 
-def write_ros_bag(scene, file, *, compression=CompressionType.ZSTD, are_cameras_free=False):
+def write_ros_bag(scene, file, *, are_cameras_free=False):
     """Write a scene as ROS 2 would have recorded it."""
     bag = BagScene(scene, are_cameras_free=are_cameras_free)
-    with RosWriter(file, compression=compression) as writer:
+    with RosWriter(file) as writer:
         for log_ns, kind, content in bag.messages():
             for topic, message in _ros_messages(writer, bag, log_ns, kind, content):
                 writer.write(f"/{topic}", log_ns, message)

@@ -12,6 +12,7 @@ from gaussian_world import (
     map_points,
     round_gaussians,
     scene_of,
+    training_view,
 )
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
@@ -19,7 +20,6 @@ from lidarpainter_models.conditioning.warping import SourceImage
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 SECOND_NS = 1_000_000_000
@@ -132,16 +132,9 @@ def views(camera_at, board, draw):
     for frame in range(NUM_VIEWS):
         camera = camera_at(0.4 * frame)
         rgb, depth_m = draw(camera, [board(WALL_X_M, top_m=4.0)])
-        found.append(
-            TrainingView(
-                key=(2 * frame, "front"),
-                camera=camera,
-                timestamp_ns=frame * 100_000_000,
-                rgb_u8=(rgb * 255).round().to(torch.uint8),
-                sky_mask=depth_m == 0,
-                lidar_depth_m=depth_m,
-            )
-        )
+        rgb_u8 = (rgb * 255).round().to(torch.uint8)
+        shown = {"rgb_u8": rgb_u8, "sky_mask": depth_m == 0, "lidar_depth_m": depth_m}
+        found.append(training_view(camera, frame=frame, key=(2 * frame, "front"), **shown))
     return found
 
 

@@ -17,7 +17,6 @@ import yaml
 class ReadBundle:
     """What a simulator takes from a bundle."""
 
-    members: list
     starts: list
     """Where the bytes of each member begin."""
     metadata: dict
@@ -39,7 +38,6 @@ def read_bundle(path):
         starts.append(one.header_offset + 30 + name_bytes + extra_bytes)
     (tracks,) = json.loads(texts["sequence_tracks.json"]).values()
     return ReadBundle(
-        members=members,
         starts=starts,
         metadata=yaml.safe_load(texts["metadata.yaml"]),
         rig=json.loads(texts["rig_trajectories.json"]),

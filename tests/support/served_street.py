@@ -139,7 +139,7 @@ def placed_object(actor_id, start, end=None):
 
 
 @contextmanager
-def served(street, *, most_waiting=16, limit_s=60.0, has_placeholders=False, **settings):
+def served(street, *, has_placeholders=False, **settings):
     """A client of a server of the street."""
     import grpc
 
@@ -152,7 +152,7 @@ def served(street, *, most_waiting=16, limit_s=60.0, has_placeholders=False, **s
         load=lambda _run: LoadedScene(edits, 1),
         most_bytes=10,
     )
-    queue = RenderQueue(most_waiting, limit_s)
+    queue = RenderQueue(most_waiting=16, limit_s=60.0)
     servicer = SensorsimServicer(scenes=pool, queue=queue, config={"painted": "false"}, **settings)
     with grpc_server(servicer, host="127.0.0.1", port=0) as port:
         size = [(f"grpc.max_{way}_message_length", wire.MOST_BYTES) for way in ("send", "receive")]
