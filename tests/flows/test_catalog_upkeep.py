@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from commands import call, refuse, succeed
+from commands import call, complaint, refuse, succeed
 from tiny_street import SCENE
 
 from catalog.store import open_store
@@ -48,9 +48,7 @@ def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
 @pytest.mark.parametrize("command", ["gc", "vacuum"])
 @pytest.mark.parametrize("days", ["nan", "inf", "1000000", "-1"])
 def test_days_that_are_no_time_are_refused_in_one_line(command, days, tmp_path):
-    answer = call("catalog", command, "--days", days, store=open_store(tmp_path))
-    assert (answer.code, answer.err.count("\n")) == (2, 1)
-    assert "--days" in answer.err
+    assert "--days" in complaint("catalog", command, "--days", days, store=open_store(tmp_path))
 
 
 def test_a_whole_store_is_verified_and_a_flipped_bit_ends_with_1(tiny_run, own_run):
@@ -115,17 +113,6 @@ def test_tables_are_compacted_vacuumed_and_read_as_they_were(own_run):
     assert succeed(*later, store=own_run.store).json["rows"] == now
 
 
-@pytest.mark.parametrize(
-    ("as_of", "expected"),
-    [
-        ("yesterday", "expected a version such as 3, or a time"),
-        ("99", "no runs as of 99, the last version is"),
-    ],
-)
-def test_a_past_that_there_was_not_is_one_line(tiny_run, as_of, expected):
-    assert expected in refuse("catalog", "list", "runs", "--as-of", as_of, store=tiny_run.store)
-
-
 def test_nothing_is_stale_and_the_scene_has_a_cost(tiny_run):
     stale = succeed("catalog", "stale", "--json", store=tiny_run.store).json
     assert (stale["scenes"], stale["runs"]) == (0, [])
@@ -137,4 +124,3 @@ def test_nothing_is_stale_and_the_scene_has_a_cost(tiny_run):
     assert spent["observations"] >= sum(one["cpu_seconds"] for one in summaries) > 0
     assert cost["attempts"]["money"] is None
     assert "stage: gaussians" in succeed("catalog", "cost", SCENE, store=tiny_run.store).out
-    assert "no run and no attempt" in refuse("catalog", "cost", "toy/none", store=tiny_run.store)

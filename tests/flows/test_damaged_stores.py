@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from commands import call
+from commands import call, complaint
 from toy_store import TOY_SCENE, write_toy_scene
 
 from catalog.store import open_store
@@ -35,12 +35,7 @@ def store(tmp_path):
 
 
 def refused(store, words, expected):
-    answer = call(*words, store=store)
-    assert answer.code == 2, answer
-    assert answer.out == ""
-    assert answer.err.count("\n") == 1
-    assert expected in answer.err
-    assert "lidarpainter: unexpected" not in answer.err
+    assert expected in complaint(*words, store=store)
 
 
 def overwrite(paths, content):

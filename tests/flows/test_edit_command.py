@@ -10,8 +10,6 @@ from lidarpainter_models.editing.apply import edited
 from tasks.runs import open_run
 from tasks.stored import load_observations, load_scene
 
-AHEAD = "nearest-ahead"
-
 
 @pytest.fixture(scope="module")
 def ahead(own_run):
@@ -111,41 +109,6 @@ def test_edits_are_done_once_for_check_images_and_scene(own_run, ahead, monkeypa
     )
     succeed("edit", own_run.run_id, "scale", ahead, "factor=1.2", store=own_run.store)
     assert len(done) == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (("remove", "bus"), "no actor 'bus', expected an id"),
-        (("move", AHEAD, "trajectory=latral:2"), "trajectory 'latral:2': expected one of"),
-        (("move", AHEAD), "trajectory: Field required"),
-        (("move", "trajectory=lateral:2"), "move takes one name, got none"),
-        (("stop", AHEAD, "at_s=soon"), "at_s=soon: expected a number"),
-        (("stop", AHEAD, "at_s=nan"), "finite number"),
-        (("lamps", AHEAD, "state=blue"), "state: Input should be 'off', 'on' or 'brake'"),
-        (("lamps", AHEAD, "state=off"), "lamps are seen at night alone: expected a style"),
-        (("fly", AHEAD), "does not match any of the expected"),
-        (("insert", "new", "source.ply=nowhere.ply"), "no file nowhere.ply"),
-        (("insert", "new", "source.run=nobody", "source.actor=a"), "no run_id 'nobody'"),
-        (("join", "nobody"), "no run_id 'nobody'"),
-        (("style", "prompt=snow"), "no style 'snow', expected clear, foggy"),
-        (("style", "prompt=foggy", "strength=2"), "strength: Input should be less than"),
-        (("style", "prompt=foggy", "seed=0.5"), "seed=0.5: expected a whole number"),
-        (("style", AHEAD, "prompt=foggy"), "style takes no name, got nearest-ahead"),
-        (("drive", "trajectory=latral:2"), "trajectory 'latral:2': expected one of"),
-        (("join",), "join takes one name, got none"),
-        (("join", "latest"), "that run has seen nothing much better than this one"),
-        ((), "expected at least one operation"),
-        (("--script", "nowhere.json"), "script nowhere.json cannot be read"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line_and_leaves_nothing(own_run, words, complaint):
-    before = own_run.store.tables.rows("runs")
-    answer = call("edit", own_run.run_id, *words, store=own_run.store)
-    assert answer.code == 2
-    assert complaint in answer.err
-    assert answer.err.count("\n") == 1
-    assert own_run.store.tables.rows("runs") == before
 
 
 def test_runs_of_places_that_nothing_ties_are_not_joined(own_run, monkeypatch):

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from commands import call, seen_image, succeed
+from commands import seen_image, succeed
 from plyfile import PlyData
 from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SIDE, WIDTH_PX
 
@@ -92,46 +92,6 @@ def test_a_camera_that_no_fit_used_rides_on_the_rig_as_the_fit_found_it(tiny_run
     assert not torch.allclose(found[SIDE], logged[SIDE], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (("--format", "obj", "--out", "a"), "--format 'obj': expected one of ply, spz"),
-        (
-            ("--format", "ply", "--out", "a.ply", "--time", "soon"),
-            "--time 'soon': expected seconds",
-        ),
-        (("--format", "ply", "--out", "a.ply", "--actors", "x"), "has no actor 'x', it has"),
-        (("--format", "video", "--out", "a.mp4", "--sky"), "--format video has no use for --sky"),
-        (
-            ("--format", "ply", "--out", "a.ply", "--camera", "all"),
-            "--format ply has no use for --camera",
-        ),
-        (
-            ("--format", "gltf", "--out", "a.glb", "--per-actor"),
-            "--format gltf has no use for --per-actor",
-        ),
-        (
-            ("--format", "depth", "--out", "a", "--postpaint"),
-            "--format depth has no use for --postpaint",
-        ),
-        (("--format", "spz", "--out", "a.spz", "--spz-version", "2"), "expected 3 or 4"),
-        (("--format", "depth", "--out", "a", "--camera", "roof"), "has no camera 'roof'"),
-        (("--format", "depth", "--out", "a", "--width", "9999"), "expected at most"),
-        (("--format", "video", "--out", "a.mp4", "--fps", "0"), "--fps 0: expected above 0"),
-        (("--format", "video", "--out", "a.mp4", "--beside", "ffff"), "'ffff'"),
-        (("--format", "colmap", "--out", "a", "--postpaint"), "taken as they are"),
-        (("--format", "ply", "--out", "/proc/no/a.ply"), "cannot be written"),
-    ],
-)
-def test_wrong_words_are_answered_in_one_line(tiny_run, tmp_path, monkeypatch, words, complaint):
-    monkeypatch.chdir(tmp_path)
-    answer = call("export", tiny_run.run_id, *words, store=tiny_run.store)
-    assert answer.code == 2, answer.err
-    (line,) = [one for one in answer.err.splitlines() if one.startswith("lidarpainter: ")]
-    assert complaint in line
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_frames_are_numbered_as_recorded(tiny_run, tmp_path):
     words = ("--format", "lidar-bin", "--out", tmp_path / "a", "--frames", f"{NUM_FRAMES - 1}:")
     made = succeed("export", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
@@ -148,24 +108,6 @@ def test_page_is_one_file_that_names_the_scene(tiny_run, tmp_path):
     assert answer.json["path"] == str(out)
     assert answer.json["bytes"] == len(page) < 3_000_000
     assert f"<title>LidarPainter: {tiny_run.result['scene']}</title>" in page
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--postpaint",), "a browser shows the scene itself"),
-        (("--trajectory", "lateral:90"), "lateral:90"),
-        (("--camera", "rear"), "rear"),
-    ],
-)
-def test_page_that_cannot_be_is_one_line(tiny_run, tmp_path, words, expected):
-    out = tmp_path / "drive.html"
-    asked = ("export", tiny_run.run_id, "--format", "page", "--out", out, *words)
-    answer = call(*asked, store=tiny_run.store)
-    assert answer.code == 2
-    assert expected in answer.err
-    assert answer.err.count("\n") == 1
-    assert not out.exists()
 
 
 def test_view_says_where_it_is_and_opens_a_browser_there(tiny_run, monkeypatch):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import refuse, succeed
+from commands import succeed
 from pyarrow import parquet
 from tiny_street import QUICK_LIDAR, SCENE, reconstructed
 
@@ -99,24 +99,3 @@ def test_the_sensor_of_a_log_is_estimated_and_its_file_taken(tiny_run, tmp_path)
     succeed("render", tiny_run.run_id, *words, *where, store=tiny_run.store)
     (written,) = (tmp_path / "s").rglob("*.pcd.bin")
     assert written.stat().st_size % 20 == 0
-
-
-RENDER = ("render", "latest", "--trajectory", "recorded", "--out", "x")
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ((*RENDER, "--lidar", "sonar"), "sensor 'sonar': expected hdl-32e"),
-        ((*RENDER, "--lidar", "gone.json"), "gone.json: cannot be read as a sensor"),
-        ((*RENDER, "--lidar", "log", "--lidar-format", "las"), "'las': expected pcd"),
-        ((*RENDER, "--lidar", "log", "--video"), "--video"),
-        ((*RENDER, "--lidar-format", "npz"), "--lidar-format needs --lidar"),
-        (("evaluate", "latest", "--protocol", "lidar", "--postpaint"), "--postpaint"),
-        (("evaluate", "latest", "--protocol", "lidar", "--all-views"), "--all-views"),
-        (("lidar-model", SCENE, "--lidar", "roof"), "LiDAR 'roof' is needed"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line(tiny_run, tmp_path, monkeypatch, words, expected):
-    monkeypatch.chdir(tmp_path)
-    assert expected in refuse(*words, store=tiny_run.store)

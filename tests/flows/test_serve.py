@@ -90,20 +90,6 @@ def request_of(image, actors):
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--memory", "much"), "--memory"),
-        (("--time-limit", "soon"), "--time-limit"),
-        (("--device", "tpu"), "tpu"),
-        (("--refuse-below", "0.5", "--no-trust"), "--refuse-below"),
-        (("--painter", "nobody"), "nobody"),
-    ],
-)
-def test_what_cannot_be_served_is_one_line(tiny_run, words, expected):
-    assert expected in refuse("serve", tiny_run.run_id, *words, store=tiny_run.store)
-
-
 def test_a_missing_extra_is_one_line(tiny_run, monkeypatch):
     monkeypatch.setitem(sys.modules, "grpc", None)
     line = refuse("serve", tiny_run.run_id, "--port", "0", store=tiny_run.store)

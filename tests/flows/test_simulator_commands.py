@@ -104,12 +104,6 @@ def test_check_bundle_finds_nothing_that_fails(bundle):
     assert "what" in succeed("check-bundle", bundle[0]).out
 
 
-def test_wrong_words_of_the_bundle_are_refused(tiny_run, tmp_path):
-    words = ("export", tiny_run.run_id, "--format", "simulator", "--out")
-    assert "expected a name in .usdz" in refuse(*words, tmp_path / "a.zip", store=tiny_run.store)
-    assert "is not there" in refuse("check-bundle", tmp_path / "none.usdz")
-
-
 def test_drive_goes_through_the_server_and_writes_a_film(tiny_run, tmp_path):
     script = tmp_path / "mine.py"
     script.write_text(

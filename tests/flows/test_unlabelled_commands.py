@@ -108,19 +108,6 @@ def test_boxes_that_a_person_changed_are_written_as_they_were_changed(store, tmp
     assert after.manifest["provenance"]["label"]["edits"] == changes
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("view", STREET, "--label", "--camera", "front"), "--label has no use for --camera"),
-        (("view", STREET, "--edits", "a.json"), "view of a run has no use for --edits"),
-        (("label", STREET, "--edits", "missing.json"), "missing.json is no file of edits"),
-        (("label", STREET, "--edits", "a.json", "--complete"), "--edits has no use for --complete"),
-    ],
-)
-def test_options_that_mean_nothing_there_are_refused(store, words, expected):
-    assert expected in refuse(*words, store=store)
-
-
 def test_a_scene_of_another_origin_is_not_replaced(store):
     line = refuse("localise", STREET, "--as", "stripped", store=store)
     assert "was not made of synthetic/street-0012 by localise; it was kept" in line

@@ -55,6 +55,16 @@ def refuse(*words, store=None):
     return line
 
 
+def complaint(*words, store=None):
+    """As `refuse`, of a command that says nothing else at all."""
+    answer = call(*words, store=store)
+    assert (answer.code, answer.out) == (2, ""), answer
+    assert answer.err.startswith("lidarpainter: ")
+    assert answer.err.count("\n") == 1
+    assert "unexpected" not in answer.err
+    return answer.err
+
+
 def settings(*assignments):
     """The words of `--set`."""
     return [word for assignment in assignments for word in ("--set", assignment)]
