@@ -4,11 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import pytest
+from production_services import answers
+from waiting import until
 
 PROXIES = dict.fromkeys(("http_proxy", "https_proxy", "all_proxy"), "http://127.0.0.1:9")
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,14 +30,6 @@ def work(seconds):
 with server.prefect_server(Path(sys.argv[1])):
     print(work(float(sys.argv[2])), flush=True)
 """
-
-
-def answers(api: str) -> bool:
-    try:
-        with urllib.request.urlopen(f"{api}/health", timeout=5) as answer:  # noqa: S310 - our own
-            return answer.status == 200
-    except OSError:
-        return False
 
 
 def start_flow(tmp_path, seconds):
@@ -76,7 +68,4 @@ def test_a_killed_flow_leaves_no_server_behind(tmp_path):
     assert answers(api)
     flow.send_signal(signal.SIGKILL)
     flow.communicate()
-    deadline = time.monotonic() + 10
-    while answers(api):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    until(lambda: not answers(api), seconds=10)

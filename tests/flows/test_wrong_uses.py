@@ -6,7 +6,6 @@ import resource
 import shlex
 import tempfile
 import threading
-import time
 from contextlib import contextmanager, redirect_stderr
 from io import StringIO
 from pathlib import Path
@@ -16,6 +15,7 @@ import torch
 from commands import call, refuse
 from small_pandaset import PandasetFolder
 from toy_store import TOY_SCENE, write_toy_scene
+from waiting import until
 
 from catalog.store import Store, open_store
 from flows.cli.main import main
@@ -285,9 +285,7 @@ def test_the_second_of_two_says_whom_it_waits_for(place, tmp_path):
         second = threading.Thread(target=lambda: codes.append(main(words)))
         with store.scene_lock(scene_id):
             second.start()
-            deadline = time.monotonic() + 60
-            while "waiting for process" not in said.getvalue() and time.monotonic() < deadline:
-                time.sleep(0.02)
+            until(lambda: "waiting for process" in said.getvalue())
             assert not (store.root / "scenes").exists()
         second.join()
     assert f"ingest: waiting for process {os.getpid()}" in said.getvalue()

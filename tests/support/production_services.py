@@ -111,17 +111,10 @@ class PrefectService:
         words = ["server", "start", "--host", "127.0.0.1", "--port", str(self._port), "--no-ui"]
         self.process = self.spawn(words, "server", environment)
         deadline = time.monotonic() + START_S
-        while not self.answers():
+        while not answers(self.url):
             assert self.process.poll() is None, f"see {self.folder / 'server.log'}"
             assert time.monotonic() < deadline, f"see {self.folder / 'server.log'}"
             time.sleep(0.5)
-
-    def answers(self):
-        try:
-            with urllib.request.urlopen(f"{self.url}/health", timeout=5) as answer:  # noqa: S310
-                return answer.status == 200
-        except OSError:
-            return False
 
     def spawn(self, words, name, environment=None):
         """`prefect ...` with a log and a session of its own, until `end`."""
@@ -146,6 +139,15 @@ class PrefectService:
         end_processes(self.folder, signal.SIGKILL)
         for process in self._spawned:
             process.wait()
+
+
+def answers(api):
+    """Whether a Prefect API is in health."""
+    try:
+        with urllib.request.urlopen(f"{api}/health", timeout=5) as answer:  # noqa: S310 - our own
+            return answer.status == 200
+    except OSError:
+        return False
 
 
 def end_processes(folder, number):

@@ -19,6 +19,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
+from nuscenes_log import FAR_AWAY
 from scipy.spatial.transform import Rotation
 
 from lidarpainter_models.geometry.boxes import is_inside_box
@@ -75,15 +76,6 @@ NEAR_LIDARS = {
 }
 NEAR_LIMITS_RAD = (-np.pi / 2, np.pi / 6)
 TOP_YAW_DEG = 148.0
-
-
-def far_away():
-    """A rigid global_from_world, some kilometres from the origin and turned about every axis."""
-    pose = torch.eye(4, dtype=torch.float64)
-    turn = Rotation.from_euler("zyx", [131.0, 0.4, -0.7], degrees=True).as_matrix()
-    pose[:3, :3] = torch.from_numpy(turn)
-    pose[:3, 3] = torch.tensor([-2311.0, 1804.5, -160.25], dtype=torch.float64)
-    return pose
 
 
 @dataclass
@@ -159,7 +151,7 @@ def write_truth(
         vehicle_from_camera={rig.name: ego_from_camera(rig) for rig in street.config.cameras},
         reach_m=reach_m,
     )
-    header = SceneHeader(licence="drawn", global_from_world=far_away())
+    header = SceneHeader(licence="drawn", global_from_world=FAR_AWAY)
     with SceneWriter(folder, "truth", "waymo", header) as writer:
         for frame_index in range(street.config.num_frames):
             _write_frame(truth, frame_index, writer)
@@ -216,7 +208,7 @@ def _write_frame(truth, frame_index, writer):
     velocity = ((ahead - world_from_ego)[:3, 3] / (step_ns / 1e9)).numpy()
     between = (world_from_ego[:3, :3].T @ ahead[:3, :3]).numpy()
     turn = Rotation.from_matrix(between).as_rotvec() / (step_ns / 1e9)
-    truth.velocities[frame_index] = far_away()[:3, :3].numpy() @ velocity, turn
+    truth.velocities[frame_index] = FAR_AWAY[:3, :3].numpy() @ velocity, turn
     for rig in street.config.cameras:
         pose = moved(world_from_ego, velocity, turn, CAMERAS[rig.name].exposure_ms / 1e3)
         _write_image(truth, rig.name, timestamp_ns, pose, writer)
