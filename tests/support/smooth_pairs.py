@@ -1,13 +1,13 @@
 """Pairs that a small painter learns from in a moment."""
 
 import hashlib
+from dataclasses import replace
 
 import torch
 from random_conditions import random_conditions
 
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.filters import blur
-from lidarpainter_models.painter.protocol import PaintingConditions
 
 
 def smooth_pair(side_px=48, seed=0):
@@ -17,16 +17,12 @@ def smooth_pair(side_px=48, seed=0):
     truth = (0.5 + 4 * (blur(noise, sigma_px=4.0)[0] - 0.5)).clamp(0, 1).permute(1, 2, 0)
     old = random_conditions(side_px, side_px, seed=seed)
     shake = 0.3 * (torch.rand(side_px, side_px, 3, generator=generator) - 0.5)
-    conditions = PaintingConditions(
+    conditions = replace(
+        old,
         render_rgb=(truth + shake).clamp(0, 1),
-        render_depth_m=old.render_depth_m,
         render_alpha=torch.ones(side_px, side_px),
         lidar_rgb=truth * old.lidar_hit[..., None],
-        lidar_depth_m=old.lidar_depth_m,
-        lidar_hit=old.lidar_hit,
         warp_rgb=truth * old.warp_valid[..., None],
-        warp_valid=old.warp_valid,
-        reference_rgb=old.reference_rgb,
     )
     everywhere = torch.ones(side_px, side_px, dtype=torch.bool)
     return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=everywhere)

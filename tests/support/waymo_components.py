@@ -12,25 +12,20 @@ from waymo_numbers import (
 )
 
 
-def write_v2(truth, folder, segment=SEGMENT, *, rows_per_group=5):
+def write_v2(truth, folder, segment=SEGMENT):
     """One Parquet file per component; gives the folder."""
     for component, table in component_tables(truth, segment).items():
         path = folder / component / f"{segment}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, path, row_group_size=rows_per_group)
+        pq.write_table(table, path, row_group_size=5)
     return folder
 
 
-def component_tables(truth, segment=SEGMENT):
+def component_tables(truth, segment):
     """The components that the reader joins, as Arrow tables."""
     frames = [frame_numbers(truth, index) for index in truth.scene.frame_indices]
     cameras = [camera_numbers(truth, name) for name in truth.scene.camera_names]
     lidars = [lidar_numbers(truth, name) for name in truth.scene.lidar_names]
-    return component_tables_of(frames, cameras, lidars, segment)
-
-
-def component_tables_of(frames, cameras, lidars, segment):
-    """The components of frames and calibrations in plain numbers."""
     rows = {
         "vehicle_pose": [
             {**_key(frame), "[VehiclePoseComponent].world_from_vehicle.transform": frame.pose}

@@ -39,22 +39,13 @@ def frame_messages(truth, segment=SEGMENT):
     ]
 
 
-def context_message(truth, segment=SEGMENT):
+def context_message(truth, segment):
     """Name and calibrations, which every frame repeats."""
     cameras = [camera_numbers(truth, name) for name in truth.scene.camera_names]
     lidars = [lidar_numbers(truth, name) for name in truth.scene.lidar_names]
-    return context_of(cameras, lidars, segment)
-
-
-def context_of(cameras, lidars, segment=SEGMENT):
-    """The context of calibrations in plain numbers."""
-    return b"".join(
-        [
-            text(1, segment),
-            *[message(2, camera_message(camera)) for camera in cameras],
-            *[message(3, lidar_message(lidar)) for lidar in lidars],
-        ]
-    )
+    calibrations = [message(2, camera_message(camera)) for camera in cameras]
+    calibrations += [message(3, lidar_message(lidar)) for lidar in lidars]
+    return b"".join([text(1, segment), *calibrations])
 
 
 def camera_message(camera):
