@@ -94,6 +94,8 @@ def test_what_cannot_be_done_with_a_run_is_one_line_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     before = tiny_run.store.tables.rows("runs")
     written = [word.format(run=tiny_run.run_id) for word in shlex.split(words)]
-    assert expected in complaint(*written, store=tiny_run.store)
+    said = complaint(*written, store=tiny_run.store)
+    assert expected in said
+    assert "unexpected" not in said
     assert list(tmp_path.iterdir()) == []
     assert tiny_run.store.tables.rows("runs") == before

@@ -60,8 +60,8 @@ def complaint(*words, store=None):
     answer = call(*words, store=store)
     assert (answer.code, answer.out) == (2, ""), answer
     assert answer.err.startswith("lidarpainter: ")
+    assert not answer.err.startswith("lidarpainter: unexpected")
     assert answer.err.count("\n") == 1
-    assert "unexpected" not in answer.err
     return answer.err
 
 

@@ -62,11 +62,12 @@ def painted_points(gains, seeds=range(1)):
     ]
 
 
-def trials_of(cause, *levels):
+def trials_of(cause, *levels, dataset="stress"):
     """Trials of a cause on the first scene."""
+    named = {level: f"{dataset}/{cause}-{level}" for level in levels}
     return [
-        Trial(scene=SCENES[0], cause=cause, level=float(level), spoilt=f"stress/{cause}-{level}")
-        for level in levels
+        Trial(scene=SCENES[0], cause=cause, level=float(level), spoilt=spoilt)
+        for level, spoilt in named.items()
     ]
 
 
@@ -187,7 +188,7 @@ def test_a_sweep_that_another_took_over_is_refused(tmp_path, monkeypatch, other,
 
 
 def test_stress_says_where_painting_hurts(tmp_path):
-    scene, trials = SCENES[0], trials_of("beams", "32", "16", "8")
+    scene, trials = SCENES[0], trials_of("beams", "32", "16", "8", dataset="synthetic")
     names = [scene, *(trial.spoilt for trial in trials)]
     points = painted_points(dict(zip(names, (2.0, 1.5, 0.8, -0.4), strict=True)), range(2))
     result = stress_of(points, trials, tmp_path)
