@@ -10,6 +10,7 @@ import json
 import os
 import pickle
 from pathlib import Path
+from typing import Any
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import RigLidar, SyntheticStreetConfig, write_street
@@ -18,7 +19,7 @@ from lidarpainter_models.synthetic.world.city import build_city
 
 def recorded_street(store, cameras, *, beams=32, **settings):
     """A small street as these cameras and one LiDAR record it."""
-    small = {
+    small: dict[str, Any] = {
         "seed": 5,
         "num_frames": 3,
         "width_px": 96,
