@@ -135,12 +135,7 @@ def trust_envelope(
     device = views.gatherer.scene.device
     for number, (stretch, moments) in enumerate(looked_at):
         walk = _Walk(views, moments, calibration)
-        row: dict[str, Any] = {
-            "from_m": stretch.from_m,
-            "to_m": stretch.to_m,
-            "first_frame": stretch.first_frame,
-            "last_frame": stretch.last_frame,
-        }
+        row: dict[str, Any] = asdict(stretch)
         row["recorded_confidence"], row["recorded_db"] = walk.recorded()
         is_trusted = row["recorded_confidence"] >= PROMISED
         done = number * (1 + len(DIRECTIONS)) + 1

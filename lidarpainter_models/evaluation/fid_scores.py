@@ -10,12 +10,7 @@ from torch import Tensor
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.metrics.fid import (
-    LEAST_IMAGES,
-    TOO_FEW,
-    frechet_distance,
-    kernel_distance,
-)
+from lidarpainter_models.metrics.fid import LEAST_IMAGES, TOO_FEW, frechet_distance, kernel_distance
 from lidarpainter_models.metrics.inception import NO_WEIGHTS, Inception
 from lidarpainter_models.scenes.records import RecordedView
 
@@ -29,10 +24,7 @@ def fid_scores(
 ) -> dict[str, dict[str, Any]]:
     """`fid` and `kid` of each set of shown images, or None with the reason.
 
-    Args:
-        network: Inception; without it nothing is looked at.
-        real: recorded images, rgb 0..1.
-        shown: images of each trajectory, rgb 0..1.
+    Images are rgb in 0..1, those shown by trajectory; without a network nothing is looked at.
 
     Returns:
         By trajectory: `fid`, `kid`, `num_real` and `num_shown` images, or `fid_reason` and

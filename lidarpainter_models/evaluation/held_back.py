@@ -9,8 +9,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence, Set
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +18,6 @@ import torch
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.view_scores import ScoredView
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.examples import PaintingPair, Window
 from lidarpainter_models.painter.nano.painter import NanoPainter
@@ -209,29 +207,22 @@ def hold_back(
         targets = {target_of(folder, index) for index in range(len(folder))}
         count = math.ceil(share * len(targets)) if len(targets) > 1 else 0
         held.update(sorted(targets, key=_mixed)[:count])
-    learnt = without_targets(folders, held)
-    judged = {}
-    for name, folder in folders.items():
-        judges = held - known
-        indices = [index for index in range(len(folder)) if target_of(folder, index) in judges]
-        if indices:
-            judged[name] = PairSubset(folder, name, indices)
+    learnt = _aiming(folders, lambda target: target not in held)
     if folders and not learnt:
         raise ConfigError(f"with a share of {share} held back no pair is left to learn from")
-    return learnt, judged
+    return learnt, _aiming(folders, lambda target: target in held and target not in known)
 
 
-def without_targets(folders: Mapping[str, PairFolder], targets: Set[str]) -> dict[str, PairSubset]:
-    """The pairs that aim at none of some targets; empty sets are left out."""
-    kept = {
-        name: PairSubset(
-            folder,
-            name,
-            [index for index in range(len(folder)) if target_of(folder, index) not in targets],
-        )
-        for name, folder in folders.items()
-    }
-    return {name: subset for name, subset in kept.items() if len(subset)}
+def _aiming(
+    folders: Mapping[str, PairFolder], is_wanted: Callable[[str], bool]
+) -> dict[str, PairSubset]:
+    """The pairs that aim at wanted targets; empty sets are left out."""
+    found = {}
+    for name, folder in folders.items():
+        indices = [index for index in range(len(folder)) if is_wanted(target_of(folder, index))]
+        if indices:
+            found[name] = PairSubset(folder, name, indices)
+    return found
 
 
 def unseen_pairs(
@@ -242,7 +233,8 @@ def unseen_pairs(
     Raises:
         DataError: every pair's target was trained on.
     """
-    unseen = without_targets(folders, frozenset().union(*known))
+    learnt = frozenset().union(*known)
+    unseen = _aiming(folders, lambda target: target not in learnt)
     if not unseen:
         raise DataError(
             f"no pair of {', '.join(folders) or 'no folder'} is left to judge by: a painter was "
@@ -275,7 +267,11 @@ class HeldOutPairs:
     def read(self, index: int) -> PaintingPair:
         """The pair of a held-out view; its target is known but for the recording car."""
         view = self.held_out.test_views[index]
-        judged = self._judged(view)
+        alone, fitted = replace(self.held_out, test_views=[view]), self.builder.scene
+        if self.beside is None:
+            (judged,) = alone.recorded_views(fitted, "interpolated")
+        else:
+            (judged,) = alone.synthetic_views(fitted, *self.beside)
         conditions = self.builder.conditions(
             judged.camera, judged.timestamp_ns, camera_name=view.camera_name
         )
@@ -283,13 +279,6 @@ class HeldOutPairs:
         everywhere = torch.ones(truth.shape[:2], dtype=torch.bool)
         known = everywhere if judged.hidden is None else ~judged.hidden
         return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=known)
-
-    def _judged(self, view: RecordedView) -> ScoredView:
-        alone, fitted = replace(self.held_out, test_views=[view]), self.builder.scene
-        if self.beside is None:
-            return alone.recorded_views(fitted, "interpolated")[0]
-        street, shift = self.beside
-        return alone.synthetic_views(fitted, street, shift)[0]
 
 
 def held_out_pairs(
@@ -308,7 +297,7 @@ def held_out_pairs(
 
 
 def unseen_views(
-    views: Sequence[RecordedView], scene_id: str, trained: AbstractSet[str]
+    views: Sequence[RecordedView], scene_id: str, trained: Set[str]
 ) -> list[RecordedView]:
     """The views of a scene of which no painter was trained on an image, from whatever place.
 

@@ -73,11 +73,7 @@ class HeldOut:
         return fitted.refined_camera(view, camera)
 
     def shifted_camera(
-        self,
-        fitted: GaussianScene,
-        view: RecordedView,
-        shift: Shift,
-        poses: Poses = "interpolated",
+        self, fitted: GaussianScene, view: RecordedView, shift: Shift, poses: Poses = "interpolated"
     ) -> Camera:
         """The camera of a view moved beside the path."""
         camera = self.camera_of(fitted, view, poses)

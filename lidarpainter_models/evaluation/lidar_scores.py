@@ -26,7 +26,6 @@ from lidarpainter_models.lidar.firings import MountedLidar, SweepRays, recorded_
 from lidarpainter_models.lidar.points_on_actors import BACKGROUND, MovingBoxes
 from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import Sweep
 
 BANDS_M = (0.0, 10.0, 20.0, 40.0, 80.0, 1000.0)
 LEFT_OUT = {"pandar64": (62, 63)}
@@ -49,13 +48,6 @@ class LidarEvaluation:
     lidar: MountedLidar
     test_frames: tuple[int, ...]
 
-    @property
-    def sweeps(self) -> list[Sweep]:
-        """The sweeps that no fit has read."""
-        held = set(self.test_frames)
-        swept = (sweep for sweep in self.scene.sweeps if sweep.frame_index in held)
-        return [sweep for sweep in swept if sweep.lidar_name == self.lidar.name]
-
     def scores(
         self,
         channel: LidarChannel,
@@ -67,7 +59,8 @@ class LidarEvaluation:
         Raises:
             ConfigError: no sweep was held out.
         """
-        sweeps = self.sweeps
+        swept = (one for one in self.scene.sweeps if one.frame_index in self.test_frames)
+        sweeps = [sweep for sweep in swept if sweep.lidar_name == self.lidar.name]
         if not sweeps:
             raise ConfigError(
                 f"{self.scene.path.name}: no sweep of {self.lidar.name!r} was held out to judge by"
@@ -78,14 +71,14 @@ class LidarEvaluation:
             rays = recorded_rays(self.scene, sweep, self.lidar)
             left_out = torch.tensor(LEFT_OUT.get(self.lidar.sensor.name, ()), dtype=torch.int64)
             rays = rays.select((~torch.isin(rays.beam, left_out)).nonzero()[:, 0])
-            swept = channel.simulated(fitted, rays)
-            judged.append(_Judged.of(rays, swept, boxes, channel.full_intensity))
+            told = channel.simulated(fitted, rays)
+            judged.append(_Judged.of(rays, told, boxes, channel.full_intensity))
             progress(done, len(sweeps))
-        told = _by_protocol(judged)
+        by_protocol = _by_protocol(judged)
         if not self.lidar.tells_lost:
-            told["ray_drop_accuracy"] = None
+            by_protocol["ray_drop_accuracy"] = None
         return {
-            "neurad-studio": told,
+            "neurad-studio": by_protocol,
             "own": dict(_own(judged, boxes)),
             "lidar": self.lidar.name,
             "num_sweeps": len(sweeps),

@@ -11,7 +11,6 @@ were, and why a distance is absent.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from typing import Any
 
@@ -74,11 +73,7 @@ def neurad_scores(
             if camera == name
         ]
         scores = score_views(
-            shown.renderer(name),
-            own,
-            distances=distances,
-            device=shown.scene.device,
-            told=told,
+            shown.renderer(name), own, distances=distances, device=shown.scene.device, told=told
         )
         found[name] = {each: getattr(scores, each) for each in FIGURES}
         found[name]["num_columns"] = own[0].camera.width_px
@@ -88,10 +83,7 @@ def neurad_scores(
 
 
 def _likeness(
-    held_out: HeldOut,
-    shown: ShownScene,
-    distances: PerceptualDistances,
-    told: Callable[[], None],
+    held_out: HeldOut, shown: ShownScene, distances: PerceptualDistances, told: Callable[[], None]
 ) -> dict[str, dict[str, Any]]:
     """FID and KID at each shift, against the held-out images, all without the rows cut off."""
     scene = held_out.scene
@@ -127,19 +119,16 @@ def cropped(view: ScoredView, rows: int) -> ScoredView:
 
 def _over_all(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """The mean over every image of all cameras."""
-    weigh = partial(_weighed, parts)
+    num_views = sum(part["num_views"] for part in parts)
+
+    def mean(name: str) -> float | None:
+        if any(part[name] is None for part in parts):
+            return None
+        return float(sum(part[name] * part["num_views"] for part in parts) / num_views)
+
     return {
-        "psnr": weigh("psnr"),
-        "ssim": weigh("ssim"),
-        "lpips": weigh("lpips"),
+        **{name: mean(name) for name in ("psnr", "ssim", "lpips")},
         "lpips_reason": parts[0]["lpips_reason"],
-        "num_views": sum(part["num_views"] for part in parts),
+        "num_views": num_views,
         "num_columns": parts[0]["num_columns"],
     }
-
-
-def _weighed(parts: list[dict[str, Any]], name: str) -> float | None:
-    if any(part[name] is None for part in parts):
-        return None
-    total = sum(part[name] * part["num_views"] for part in parts)
-    return float(total / sum(part["num_views"] for part in parts))

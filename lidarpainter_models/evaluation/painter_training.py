@@ -108,8 +108,7 @@ def _provenance(record: dict[str, Any], learnt: Iterable[PairSubset]) -> dict[st
     sets = list(learnt)
     kept = ("attribution", "training_digest", "num_pairs", "steps", "cpu_s", "seed", "torch")
     return {
-        **{key: record[key] for key in kept},
-        "software_version": record["software_version"],
+        **{key: record[key] for key in (*kept, "software_version")},
         "pairs": {one.set_name: {"digest": one.digest, "num_pairs": len(one)} for one in sets},
         TARGETS_KEY: sorted(frozenset().union(*(one.targets for one in sets))),
     }

@@ -40,21 +40,14 @@ def painting_samples(
     """
     known = [(source, index) for source in sources.values() for index in range(len(source))]
     count = min(NUM_SAMPLES, len(known))
-    chosen = [known[rank * len(known) // count] for rank in range(count)]
-    rows = [_row(painter, source, index) for source, index in chosen]
+    rows = []
+    for rank in range(count):
+        source, index = known[rank * len(known) // count]
+        pair = source.read(index)
+        seen, painted = pair.conditions, painter.paint(pair.conditions).rgb
+        rows.append(torch.cat([seen.render_rgb, seen.lidar_rgb, painted, pair.target_rgb], dim=1))
     width_px = max(row.shape[1] for row in rows)
-    return torch.cat([_widened(row, width_px) for row in rows])
-
-
-def _row(painter: Painter, source: PairSource, index: int) -> Float[Tensor, "height width 3"]:
-    pair = source.read(index)
-    seen = pair.conditions
-    painted = painter.paint(seen).rgb
-    return torch.cat([seen.render_rgb, seen.lidar_rgb, painted, pair.target_rgb], dim=1)
-
-
-def _widened(row: Float[Tensor, "height width 3"], width_px: int) -> Float[Tensor, "height wide 3"]:
-    return functional.pad(row, (0, 0, 0, width_px - row.shape[1]))
+    return torch.cat([functional.pad(row, (0, 0, 0, width_px - row.shape[1])) for row in rows])
 
 
 DAMAGED_ERROR = 0.1

@@ -7,7 +7,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 from jaxtyping import Float
@@ -34,8 +34,6 @@ from lidarpainter_models.synthetic.street import SyntheticStreet
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
 NO_IMAGES = "nobody took images there"
-Scored = Callable[[Sequence[ScoredView]], ViewScores | None]
-"""Renders views as the judged scene is shown and scores them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,16 +111,24 @@ class SceneEvaluation:
         distances: PerceptualDistances,
         told: Callable[[], None],
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Scores of the held-out images, and of exact truth beside the path by trajectory."""
         shifts = self.config.scoring.shifts
         views = [view for view in held_out.test_views if view.camera_name == name]
         part = replace(held_out, test_views=views)
-        fitted, street = shown.scene, known_street(part.scene)
-        render = shown.renderer(name)
-        scored = partial(score_views, render, distances=distances, device=fitted.device, told=told)
-        recorded = score_recorded(scored, part, fitted)
+        fitted, street, render = shown.scene, known_street(part.scene), shown.renderer(name)
+
+        def scored(judged: Sequence[ScoredView]) -> dict[str, Any]:
+            return _view_scores(
+                score_views(render, judged, distances=distances, device=fitted.device, told=told)
+            )
+
+        recorded = scored(part.recorded_views(fitted, "interpolated"))
+        recorded["recorded_poses"] = scored(part.recorded_views(fitted, "recorded"))
         if street is None:
             return recorded, {shift.name: _unknown(len(views)) for shift in shifts}
-        return recorded, score_synthetic(scored, part, fitted, street, shifts)
+        return recorded, {
+            shift.name: scored(part.synthetic_views(fitted, street, shift)) for shift in shifts
+        }
 
 
 def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
@@ -135,33 +141,8 @@ def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
     return found
 
 
-def score_recorded(scored: Scored, held_out: HeldOut, fitted: GaussianScene) -> dict[str, Any]:
-    """Held-out images with interpolated poses, and beside them with recorded poses."""
-    interpolated = scored(held_out.recorded_views(fitted, "interpolated"))
-    recorded = scored(held_out.recorded_views(fitted, "recorded"))
-    return {**_view_scores(interpolated), "recorded_poses": _view_scores(recorded)}
-
-
-def score_synthetic(
-    scored: Scored,
-    held_out: HeldOut,
-    fitted: GaussianScene,
-    street: SyntheticStreet,
-    shifts: Sequence[Shift],
-) -> dict[str, Any]:
-    """Exact truth beside the path, per trajectory."""
-    return {
-        shift.name: _view_scores(scored(held_out.synthetic_views(fitted, street, shift)))
-        for shift in shifts
-    }
-
-
 def score_geometry(
-    held_out: HeldOut,
-    fitted: GaussianScene,
-    shifts: Sequence[Shift],
-    *,
-    told: Callable[[], None],
+    held_out: HeldOut, fitted: GaussianScene, shifts: Sequence[Shift], *, told: Callable[[], None]
 ) -> dict[str, float | None]:
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory.
 
@@ -223,16 +204,10 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         else:
             merged[name] = first if isinstance(first, str) else None
     if "psnr_by_actor" in merged:
-        merged["actors_psnr"] = _of_all(merged["psnr_by_actor"])
+        actors = merged["psnr_by_actor"].values()
+        num, error = sum(one["num_pixels"] for one in actors), sum(map(_summed_error, actors))
+        merged["actors_psnr"] = psnr_from_error(error / num) if num else None
     return merged
-
-
-def _of_all(actors: Mapping[str, Mapping[str, Any]]) -> float | None:
-    """PSNR over the pixels of all actors; None without any."""
-    num = sum(found["num_pixels"] for found in actors.values())
-    if not num:
-        return None
-    return psnr_from_error(sum(map(_summed_error, actors.values())) / num)
 
 
 def _summed_error(found: Mapping[str, Any]) -> float:

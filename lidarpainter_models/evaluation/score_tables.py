@@ -28,11 +28,10 @@ SCORE_NOTE = "PSNR in dB; depth: part of unseen LiDAR pixels that the rendered d
 ScoreCell = str | float | int | None
 Scores = dict[str, Any]
 """`recorded` and `novel` as `reconstruct --json` prints them."""
+MetricRow = tuple[str, str, str, float | None, str | None]
 
 
-def metric_values(
-    scores: Mapping[str, Any],
-) -> list[tuple[str, str, str, float | None, str | None]]:
+def metric_values(scores: Mapping[str, Any]) -> list[MetricRow]:
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
     Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
@@ -41,19 +40,24 @@ def metric_values(
     """
     if "recorded" not in scores:
         return _by_part(scores)
-    found = []
     recorded = scores["recorded"]
-    for name, value in _numbers(recorded):
-        found.append(("recorded", "recorded", name, value, _reason(recorded, name, value)))
-    for name, value in _numbers(recorded.get("recorded_poses", {})):
-        found.append(("recorded-poses", "recorded", name, value, _reason(recorded, name, value)))
+    found: list[MetricRow] = []
+    for protocol, values in (
+        ("recorded", recorded),
+        ("recorded-poses", recorded.get("recorded_poses", {})),
+    ):
+        for name, value in _numbers(values):
+            found.append((protocol, "recorded", name, value, _reason(recorded, name, value)))
     for trajectory, values in scores["novel"].items():
         for name, value in _numbers(values):
             place = (_truth_of(name), trajectory, name)
             found.append((*place, value, _reason(values, name, value)))
+    if envelope := scores.get(ENVELOPE):
+        for name, value in least_of(envelope).items():
+            reason = UNTRUSTED if value is None else None
+            found.append((ENVELOPE, *_trusted_name(name), value, reason))
     more = [name for name in (LIDAR, MARKINGS) if name in scores]
-    further = [row for name in more for row in _by_part({name: scores[name]})]
-    return [*found, *_trusted(scores.get(ENVELOPE)), *further]
+    return found + [row for name in more for row in _by_part({name: scores[name]})]
 
 
 def _truth_of(name: str) -> str:
@@ -63,7 +67,7 @@ def _truth_of(name: str) -> str:
     return "depth" if name.startswith("depth") else "truth"
 
 
-def _by_part(scores: Mapping[str, Any]) -> list[tuple[str, str, str, float | None, str | None]]:
+def _by_part(scores: Mapping[str, Any]) -> list[MetricRow]:
     """Numbers of what was not judged as held-out views are, by camera, path or protocol."""
     name_of = next(
         (name for name in (NEURAD, LIDAR, FLICKER, MARKINGS) if name in scores), "cross-camera"
@@ -76,16 +80,6 @@ def _by_part(scores: Mapping[str, Any]) -> list[tuple[str, str, str, float | Non
         (name_of, part, name, value, values.get(f"{name}_reason", few) if value is None else None)
         for part, values in parts.items()
         for name, value in _numbers(values)
-    ]
-
-
-def _trusted(
-    envelope: Mapping[str, Any] | None,
-) -> list[tuple[str, str, str, float | None, str | None]]:
-    """The least over all stretches, direction by direction."""
-    return [
-        (ENVELOPE, *_trusted_name(name), value, UNTRUSTED if value is None else None)
-        for name, value in (least_of(envelope) if envelope else {}).items()
     ]
 
 
@@ -103,7 +97,7 @@ def values_by_view(
 ) -> dict[tuple[str, str, str], dict[str, float | None]]:
     """What means over views are the mean of: by protocol, trajectory and name, then by view.
 
-    Of an envelope what the least over stretches is the least of, by stretch.
+    Of an envelope what the least over stretches is the least of, by stretch: `0-19m`.
     """
     recorded = scores.get("recorded") or {}
     found = {("recorded", "recorded"): recorded}
@@ -114,21 +108,11 @@ def values_by_view(
         for place, values in found.items()
         if "psnr_by_view" in values
     }
-    return by_view | _by_stretch(scores.get(ENVELOPE))
-
-
-def _by_stretch(
-    envelope: Mapping[str, Any] | None,
-) -> dict[tuple[str, str, str], dict[str, float | None]]:
-    """What the least of an envelope is the least of, by stretch: `0-19m`."""
-    if not envelope:
-        return {}
-    return {
-        (ENVELOPE, *_trusted_name(name)): {
-            f"{row['from_m']:.0f}-{row['to_m']:.0f}m": row[name] for row in envelope["stretches"]
-        }
-        for name in TRUSTED
-    }
+    rows = (scores.get(ENVELOPE) or {}).get("stretches", ())
+    for name in TRUSTED if rows else ():
+        by_stretch = {f"{row['from_m']:.0f}-{row['to_m']:.0f}m": row[name] for row in rows}
+        by_view[ENVELOPE, *_trusted_name(name)] = by_stretch
+    return by_view
 
 
 def _trusted_name(name: str) -> tuple[str, str]:
