@@ -7,12 +7,13 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.scenes.tracks import ActorTrack
 
 SHADOW_HEIGHT_M = 0.03
 """Above the bottom of the box: over the road, under the car."""
@@ -63,6 +64,21 @@ class ActorModel:
             points=sampled_points(centred),
             size_m=(high - low).clamp(min=0.1),
             category=category,
+        )
+
+    def driving(
+        self, name: str, times_ns: Int[Tensor, " times"], poses: Float[Tensor, "times 4 4"]
+    ) -> ActorTrack:
+        """The track of somebody who looks so, where no LiDAR saw it."""
+        return ActorTrack(
+            actor_id=name,
+            category=self.category,
+            is_moving=True,
+            size_m=self.size_m,
+            frame_indices=torch.arange(len(times_ns)),
+            timestamps_ns=times_ns,
+            world_from_box=poses,
+            num_points=torch.zeros_like(times_ns),
         )
 
     def scaled(self, factor: float) -> "ActorModel":

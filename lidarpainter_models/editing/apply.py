@@ -181,16 +181,7 @@ def _inserted(world: EditedWorld, operation: Insert, model: ActorModel) -> Edite
         speed_mps=operation.speed_mps,
         size_m=model.size_m,
     )
-    track = ActorTrack(
-        actor_id=operation.name,
-        category=model.category,
-        is_moving=True,
-        size_m=model.size_m,
-        frame_indices=torch.arange(len(times_ns)),
-        timestamps_ns=times_ns,
-        world_from_box=poses,
-        num_points=torch.zeros_like(times_ns),
-    )
+    track = model.driving(operation.name, times_ns, poses)
     way = parse_trajectory(operation.trajectory, max_shift_m=None)
     if not way.is_recorded:
         track = rerouted(track, way, world.log, world.ground, world.path_of)

@@ -44,14 +44,10 @@ def without_unseen(
     left: Sequence[ActorTrack],
     street: MapPoints,
 ) -> GaussianScene:
-    """The edited scene without what nobody has seen.
+    """The edited scene without Gaussians of the street that nobody has seen.
 
-    Args:
-        scene: edited; its Gaussians of the street are looked at.
-        fitted: as it was before, whose surfaces hid what was behind.
-        views: recorded ones, their cameras where the fit found them to be.
-        left: who has gone.
-        street: LiDAR points without those of whoever has gone.
+    Surfaces of the scene as `fitted` hid what was behind them, in recorded views whose cameras are
+    where the fit found them. `street` lacks the LiDAR points of who has `left`.
     """
     gaussians = scene.gaussians
     was_shown, was_covered = _shown(gaussians.means.detach(), fitted, views, left)
@@ -136,17 +132,14 @@ class FilledScene:
 
 def masked_observations(world: EditedWorld) -> SceneObservations:
     """What may be seen of an edited world: images hide where somebody came or left."""
-    changed = (*world.left, *world.came)
-    views = tuple(_masked(world, view, changed) for view in world.views)
-    return SceneObservations(views=views, lidar_map=world.lidar_map, tracks=world.moving)
-
-
-def _masked(world: EditedWorld, view: TrainingView, changed: tuple) -> TrainingView:
-    camera = world.scene.refined_camera(view)
-    hidden = changed_pixels(changed, camera, view.timestamp_ns)
-    if view.hidden is not None:
-        hidden = hidden | view.hidden
-    return replace(view, hidden=hidden, lidar_depth_m=torch.where(hidden, 0.0, view.lidar_depth_m))
+    changed, views = (*world.left, *world.came), []
+    for view in world.views:
+        hidden = changed_pixels(changed, world.scene.refined_camera(view), view.timestamp_ns)
+        if view.hidden is not None:
+            hidden = hidden | view.hidden
+        depth_m = torch.where(hidden, 0.0, view.lidar_depth_m)
+        views.append(replace(view, hidden=hidden, lidar_depth_m=depth_m))
+    return SceneObservations(views=tuple(views), lidar_map=world.lidar_map, tracks=world.moving)
 
 
 def filled(world: EditedWorld, config: ConditionConfig, painter: Painter | None) -> FilledScene:

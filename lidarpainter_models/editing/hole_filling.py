@@ -96,18 +96,17 @@ def fill_holes(
     left: Sequence[ActorTrack],
     painter: Painter | None,
 ) -> Filling:
-    """Close the holes that actors left in some views.
+    """Close the holes that actors left in some recorded views, their cameras as found by the fit.
 
-    Args:
-        builder: of the edited scene, whose images and points are masked where it was edited.
-        fitted: the scene as it was before.
-        views: the recorded ones, their cameras as found by the fit.
-        left: who is not there any more.
-        painter: has the last word on colours; None leaves that to what is around.
+    The builder is of the edited scene, its images and points masked where it was edited; `fitted`
+    is the scene before. A painter has the last word on colours; None leaves that to what is around.
     """
     scene, confidence = builder.scene, [torch.zeros(0)]
     num_before = len(scene.gaussians)
-    for view in _chosen(views, left):
+    shown = [
+        view for view in views if bool(changed_pixels(left, view.camera, view.timestamp_ns).any())
+    ]
+    for view in sampled_views(shown, MOST_VIEWS):
         before_m = fitted.render(view.camera, view.timestamp_ns).depth_m
         covered = shown_actors(view.camera, before_m, view.timestamp_ns, left)
         render = scene.render(view.camera, view.timestamp_ns)
@@ -121,14 +120,6 @@ def fill_holes(
         scene = filling.added_to(scene)
     added = scene.gaussians.select(torch.arange(num_before, len(scene.gaussians)))
     return Filling(gaussians=added, confidence=torch.cat(confidence))
-
-
-def _chosen(views: Sequence[TrainingView], left: Sequence[ActorTrack]) -> list[TrainingView]:
-    """Views in which somebody was, from first to last."""
-    shown = [
-        view for view in views if bool(changed_pixels(left, view.camera, view.timestamp_ns).any())
-    ]
-    return list(sampled_views(shown, MOST_VIEWS))
 
 
 def _holes(

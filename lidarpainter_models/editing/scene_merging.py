@@ -150,13 +150,6 @@ def _joined_actor(world: EditedWorld, other: OtherRun, track: ActorTrack) -> Edi
     )
 
 
-def _ends(gaussians: GaussianSet) -> Float[Tensor, "gaussians 6 3"]:
-    """Where Gaussians fade out along their axes."""
-    axes = rotation_from_quaternion(gaussians.rotation_wxyz) * (REACH * gaussians.scale_m[:, None])
-    axes = axes.transpose(1, 2)
-    return gaussians.means[:, None] + torch.cat([axes, -axes], dim=1)
-
-
 def _continued(ours: ActorTrack, theirs: ActorTrack) -> ActorTrack:
     """Our track, with the other one's boxes before its first and after its last."""
     times_ns = theirs.timestamps_ns
@@ -220,7 +213,11 @@ class _SeenTwice:
         """The same of Gaussians, those left out that reach into what the first run saw as well."""
         found = self.is_theirs(gaussians.means)
         rows = found.nonzero()[:, 0]
-        mine_m, theirs_m = self.finest_m(_ends(gaussians.select(rows)).flatten(0, 1))
+        some = gaussians.select(rows)
+        axes = rotation_from_quaternion(some.rotation_wxyz) * (REACH * some.scale_m[:, None])
+        axes = axes.transpose(1, 2)
+        ends = some.means[:, None] + torch.cat([axes, -axes], dim=1)  # where they fade out
+        mine_m, theirs_m = self.finest_m(ends.flatten(0, 1))
         is_mine = mine_m.isfinite() & (mine_m <= theirs_m * FINER)
         found[rows] = ~is_mine.unflatten(0, (len(rows), 6)).any(dim=1)
         return found

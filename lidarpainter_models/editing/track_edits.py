@@ -7,6 +7,7 @@ are replayed on these alone. Each edit names actors as they are called after the
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,13 +16,8 @@ from jaxtyping import Int
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-from lidarpainter_models.editing.script import (
-    MOST_OPERATIONS,
-    Name,
-    OperationWords,
-    parsed,
-)
-from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.editing.script import MOST_OPERATIONS, Name, OperationWords, parsed
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack, does_move
 from lidarpainter_models.scenes.validation import require_label, require_name
@@ -30,23 +26,8 @@ Tracks = dict[str, ActorTrack]
 """By the id of the actor."""
 
 
-def _is_id(name: str) -> str:
-    try:
-        return require_name(name, "actor")
-    except DataError as error:
-        raise ValueError(str(error)) from None
-
-
-def _is_category(text: str) -> str:
-    try:
-        require_label(text, "edit")
-    except DataError as error:
-        raise ValueError(str(error)) from None
-    return text
-
-
-_Id = Annotated[Name, AfterValidator(_is_id)]
-_Category = Annotated[Name, AfterValidator(_is_category)]
+_Id = Annotated[Name, AfterValidator(partial(require_name, kind="actor"))]
+_Category = Annotated[Name, AfterValidator(partial(require_label, where="edit"))]
 
 
 class Merge(OperationWords):

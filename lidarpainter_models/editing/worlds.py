@@ -96,14 +96,16 @@ class EditedWorld:
         Raises:
             SceneError: nothing of it was fitted.
         """
-        rows, points, pose = self.rows_of(track), self._points_of(track), None
-        if self._body_of(track) is None:
-            pose = invert_rigid(_parked_pose(track))
-            points = _carried_points(points, pose)
-        gaussians = self.scene.gaussians_at(None).select(rows)
+        gaussians = self.scene.gaussians_at(None).select(self.rows_of(track))
         if not len(gaussians):
             raise SceneError(f"actor {track.actor_id!r} has no Gaussians here: nobody saw it")
-        gaussians = gaussians if pose is None else carried_gaussians(gaussians, pose)
+        if self._body_of(track) is not None:
+            points = self.lidar_map.actors.get(track.actor_id, MapPoints.concatenate([]))
+        else:
+            pose, street = invert_rigid(_parked_pose(track)), self.lidar_map.street
+            gaussians = carried_gaussians(gaussians, pose)
+            points = street.keep(self._holds(track, street.xyz_m))
+            points = replace(points, xyz_m=transform_points(pose.to(points.xyz_m), points.xyz_m))
         return ActorModel(
             gaussians=gaussians.of_body(0),
             points=points,
@@ -179,12 +181,6 @@ class EditedWorld:
         ids = [one.actor_id for one in self.scene.actors.recorded_tracks]
         return ids.index(track.actor_id) + 1 if track.actor_id in ids else None
 
-    def _points_of(self, track: ActorTrack) -> MapPoints:
-        if self._body_of(track) is not None:
-            return self.lidar_map.actors.get(track.actor_id, MapPoints.concatenate([]))
-        street = self.lidar_map.street
-        return street.keep(self._holds(track, street.xyz_m))
-
     def _holds(
         self, track: ActorTrack, points_world: Float[Tensor, "points 3"]
     ) -> Bool[Tensor, " points"]:
@@ -238,8 +234,3 @@ def _always(track: ActorTrack, log: LogTimes) -> ActorTrack:
 def as_moving(track: ActorTrack, log: LogTimes) -> ActorTrack:
     """The track of an actor that will be put in again: a parked car is there all the time."""
     return track if track.is_moving else replace(_always(track, log), is_moving=True)
-
-
-def _carried_points(points: MapPoints, target_from_source: Float[Tensor, "4 4"]) -> MapPoints:
-    xyz_m = transform_points(target_from_source.to(points.xyz_m), points.xyz_m)
-    return replace(points, xyz_m=xyz_m)

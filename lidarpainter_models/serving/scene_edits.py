@@ -104,7 +104,7 @@ class SceneEdits:
                     words = ids[place].lower()
                     named = [one for one in self.library.categories if one.lower() in words]
                     model = self.library.model(self.library.nearest((*named, USUAL)[0], None))
-                    track = _track(ids[place], model, times_ns, middles[place : place + 1])
+                    track = model.driving(ids[place], times_ns, middles[place : place + 1])
                     world = self._come(world, model, track)
                 self._show(world)
             return self._shown
@@ -123,8 +123,7 @@ class SceneEdits:
             for one in message.insert:
                 size_m = _size(one.object_size, f"actor {one.id!r}")
                 model = self._model(world, one.asset_id, one.semantic_class or USUAL, size_m)
-                times_ns, poses = track_poses(one.trajectory, f"actor {one.id!r}")
-                track = _track(one.id, model, times_ns, poses)
+                track = model.driving(one.id, *track_poses(one.trajectory, f"actor {one.id!r}"))
                 world = self._come(world, _on_bottom_of(model, size_m), track)
             self._show(world)
 
@@ -231,19 +230,4 @@ def _on_bottom_of(model: ActorModel, size_m: Float[Tensor, "3"] | None) -> Actor
         gaussians=replace(model.gaussians, means=model.gaussians.means + shift_m),
         points=replace(model.points, xyz_m=model.points.xyz_m + shift_m),
         size_m=torch.stack([*model.size_m[:2], size_m[2]]),
-    )
-
-
-def _track(
-    name: str, model: ActorModel, times_ns: Tensor, poses: Float[Tensor, "times 4 4"]
-) -> ActorTrack:
-    return ActorTrack(
-        actor_id=name,
-        category=model.category,
-        is_moving=True,
-        size_m=model.size_m,
-        frame_indices=torch.arange(len(times_ns)),
-        timestamps_ns=times_ns,
-        world_from_box=poses,
-        num_points=torch.zeros_like(times_ns),
     )

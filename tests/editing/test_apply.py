@@ -25,6 +25,9 @@ from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 
+GUEST = {"op": "insert", "name": "guest", "source": {"actor": "car"}}
+LAMPS = {"op": "lamps", "actor": "car", "state": "on"}
+MOVE = {"op": "move", "actor": "car"}
 TIMES_NS = torch.arange(4) * FRAME_NS
 GROUND_M = -0.1
 PARKED_POSE = rigid_from_tangent(torch.tensor([0, 0, 0, 5.0, 3.0, 0.5]).double())
@@ -124,14 +127,8 @@ def test_a_guest_takes_the_light_of_the_scene_and_throws_a_shadow(world):
     model = world.model_of(world.moving[0])
     dim = replace(model, road_rgb=world.road_rgb / 2)
     source = ActorSource(run="other", actor="guest")
-    operation = {
-        "op": "insert",
-        "name": "guest",
-        "source": source.model_dump(exclude_defaults=True),
-        "ahead_m": 5,
-        "left_m": 3,
-        "speed_mps": 0,
-    }
+    operation = GUEST | {"source": source.model_dump(exclude_defaults=True)}
+    operation |= {"ahead_m": 5, "left_m": 3, "speed_mps": 0}
     after = done(world, operation, models={source: dim})
     assert places(after, "guest")[:, :2].tolist() == [[5, 3]] * 4
     bottom_m = float(places(after, "guest")[0, 2] - model.size_m[2] / 2)
@@ -207,7 +204,7 @@ def test_the_road_under_a_removed_parked_car_is_mended(standing):
 
 
 def test_lamps_are_switched_from_a_time_on(world):
-    after = done(world, {"op": "lamps", "actor": "car", "state": "brake", "from_s": 0.1})
+    after = done(world, LAMPS | {"state": "brake", "from_s": 0.1})
     (change,) = after.lamps
     assert (change.actor_id, change.state) == ("car", "brake")
     assert (change.first_ns, change.last_ns) == (FRAME_NS, int(TIMES_NS[-1]) + AFTER_NS)
@@ -216,7 +213,7 @@ def test_lamps_are_switched_from_a_time_on(world):
 
 def test_edits_hold_for_images_taken_before_the_first_frame_and_after_the_last(world):
     (change,) = done(world, {"op": "lamps", "actor": "car", "state": "off"}).lamps
-    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}, "speed_mps": 10}
+    guest = GUEST | {"speed_mps": 10}
     after = done(world, guest, guest | {"name": "second", "trajectory": "lateral:-3"})
     early_ns, late_ns = -FRAME_NS, int(TIMES_NS[-1]) + FRAME_NS
     assert change.first_ns <= early_ns
@@ -229,16 +226,14 @@ def test_edits_hold_for_images_taken_before_the_first_frame_and_after_the_last(w
 
 
 def test_a_guest_that_is_slower_begins_where_it_began(world):
-    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}, "speed_mps": 10}
-    slower = {"op": "retime", "actor": "guest", "speed": 0.5}
+    guest, slower = GUEST | {"speed_mps": 10}, {"op": "retime", "actor": "guest", "speed": 0.5}
     fast, slow = (places(done(world, *ops), "guest") for ops in ((guest,), (guest, slower)))
     assert slow[[0, 2], 0].tolist() == pytest.approx(fast[[0, 1], 0].tolist(), abs=1e-3)
 
 
 def test_what_lies_behind_the_end_of_the_log_is_not_run_into(world):
     """The wall is 8 m ahead; in a second more the guest would be there."""
-    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}}
-    after = done(world, guest | {"ahead_m": 2.8, "left_m": 4, "speed_mps": 4})
+    after = done(world, GUEST | {"ahead_m": 2.8, "left_m": 4, "speed_mps": 4})
     thick = MapPoints.concatenate([after.lidar_map.street] * 9)
     walled = replace(after, lidar_map=LidarMap(street=thick, actors={}))
     assert not [one for one in encounters(walled) if one.collision.is_wall]
@@ -271,7 +266,7 @@ def test_painters_do_not_see_what_was_recorded_where_somebody_was(world):
 
 
 def test_who_is_moved_into_a_wall_is_found(world):
-    after = done(world, {"op": "move", "actor": "car", "trajectory": "lateral:-2.3"})
+    after = done(world, MOVE | {"trajectory": "lateral:-2.3"})
     thick = after.lidar_map.street
     walled = replace(
         after, lidar_map=LidarMap(street=MapPoints.concatenate([thick] * 9), actors={})
@@ -285,19 +280,10 @@ def test_who_is_moved_into_a_wall_is_found(world):
     [
         ({"op": "remove", "actors": ["bus"]}, "operation 1, remove: no actor 'bus'"),
         ({"op": "stop", "actor": "car", "at_s": 9}, "at_s 9 s: expected a time of the log, 0 to"),
-        (
-            {"op": "insert", "name": "car", "source": {"actor": "car"}},
-            "'car' is there already, expected a new name",
-        ),
-        (
-            {"op": "lamps", "actor": "car", "state": "on", "from_s": 0.2, "until_s": 0.1},
-            "operation 1, lamps: expected from_s <= until_s",
-        ),
+        (GUEST | {"name": "car"}, "'car' is there already, expected a new name"),
+        (LAMPS | {"from_s": 0.2, "until_s": 0.1}, "operation 1, lamps: expected from_s <= until_s"),
         ({"op": "crop", "from_m": 500, "to_m": 600}, "nothing stands from 500 to 600 m"),
-        (
-            {"op": "move", "actor": "car", "trajectory": "follow:bus"},
-            "operation 1, move: no actor 'bus'",
-        ),
+        (MOVE | {"trajectory": "follow:bus"}, "operation 1, move: no actor 'bus'"),
     ],
 )
 def test_what_cannot_be_done_is_said(world, operation, complaint):

@@ -109,21 +109,14 @@ def test_scores_go_with_the_names():
 @pytest.mark.parametrize(
     ("edit", "expected"),
     [
-        (
-            Delete(actors=("nobody",)),
-            "edits.json operation 2, delete: there is no actor 'nobody' among 3",
-        ),
-        (
-            Rename(actor="a", name="b"),
-            "edits.json operation 2, rename: an actor is called 'b' already",
-        ),
-        (Split(actor="a", frame=0, name="d"), "expected one of 1 to 3"),
+        (Delete(actors=("nobody",)), "delete: there is no actor 'nobody' among 3"),
+        (Rename(actor="a", name="b"), "rename: an actor is called 'b' already"),
+        (Split(actor="a", frame=0, name="d"), "split: .*expected one of 1 to 3"),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_the_number_of_the_edit(tracks, edit, expected):
-    with pytest.raises(ConfigError, match="operation 2") as refused:
+    with pytest.raises(ConfigError, match=rf"edits\.json operation 2, {expected}"):
         edited_after(tracks, [Rename(actor="c", category="sign"), edit])
-    assert expected in str(refused.value)
 
 
 @pytest.mark.parametrize(
