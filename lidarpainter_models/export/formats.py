@@ -152,10 +152,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         options=(*_WHERE, "--postpaint", "--beside"),  # the last two are refused with a reason
     ),
     ExportFormat(
-        name="lidar",
-        kind="sweeps",
-        summary="recorded LiDAR sweeps as PCD",
-        options=("--frames",),
+        name="lidar", kind="sweeps", summary="recorded LiDAR sweeps as PCD", options=("--frames",)
     ),
     ExportFormat(
         name="lidar-bin",
@@ -190,9 +187,6 @@ FORMAT_NAMES = tuple(row.name for row in FORMATS)
 
 def export_format(name: str) -> ExportFormat:
     """The row of a format.
-
-    Args:
-        name: what stands after `--format`.
 
     Raises:
         ConfigError: there is no such format.

@@ -41,10 +41,7 @@ _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 
 
 def write_ncore(
-    folder: Path,
-    scene: DrivingScene,
-    frames: Collection[int],
-    advanced: Callable[[int, int], None],
+    folder: Path, scene: DrivingScene, frames: Collection[int], advanced: Callable[[int, int], None]
 ) -> dict[str, Any]:
     """Write frames of a scene as the sequence `<dataset>_<sequence>`, a store for each sensor.
 

@@ -24,29 +24,12 @@ _MARK_WIDTH_M = 0.15
 
 
 def opendrive(road: Road, ground: GroundSurface, name: str, said: Mapping[str, str]) -> bytes:
-    """The road as the bytes of an .xodr file.
-
-    Args:
-        road: the driven road with its lanes.
-        ground: its heights.
-        name: of the road.
-        said: what else is to be known, as `userData` of the file by code.
-    """
+    """The road as the bytes of an .xodr file; what else is `said` of it is `userData` by code."""
     root = ET.Element("OpenDRIVE")
     low, high = road.line.xy_m.min(axis=0) - 20, road.line.xy_m.max(axis=0) + 20
-    header = _add(
-        root,
-        "header",
-        revMajor=1,
-        revMinor=7,
-        name=name,
-        version="1.00",
-        west=low[0],
-        east=high[0],
-        south=low[1],
-        north=high[1],
-        vendor="LidarPainter",
-    )
+    extent = {"west": low[0], "east": high[0], "south": low[1], "north": high[1]}
+    told: dict[str, float | str] = {"version": "1.00", **extent, "vendor": "LidarPainter"}
+    header = _add(root, "header", revMajor=1, revMinor=7, name=name, **told)
     for code, value in said.items():
         _add(header, "userData", code=code, value=value)
     pieces = max(1, round((road.line.s_m[-1] - road.line.s_m[0]) / PIECE_M))
@@ -124,21 +107,12 @@ def _add_lanes(
 
 
 def _add_mark(lane: ET.Element, mark: str) -> None:
-    _add(
-        lane,
-        "roadMark",
-        sOffset=0,
-        type=mark,
-        weight="standard",
-        color="standard",
-        width=_MARK_WIDTH_M,
-    )
+    usual = {"weight": "standard", "color": "standard"}
+    _add(lane, "roadMark", sOffset=0, type=mark, **usual, width=_MARK_WIDTH_M)
 
 
 def _add_heights(
-    parent: ET.Element,
-    starts_m: Float[np.ndarray, " ends"],
-    heights_m: Float[np.ndarray, " ends"],
+    parent: ET.Element, starts_m: Float[np.ndarray, " ends"], heights_m: Float[np.ndarray, " ends"]
 ) -> None:
     """A profile through heights at the ends of the pieces, with continuous slope."""
     slope = np.gradient(heights_m, starts_m)

@@ -37,9 +37,7 @@ class Comparison:
     """One view before and after beside the truth, with the images it was made from."""
 
     title: str
-    before_label: str
     before_rgb: Float[Tensor, "height width 3"]
-    after_label: str
     after_rgb: Float[Tensor, "height width 3"]
     truth_rgb: Float[Tensor, "height width 3"] | None = None
     """None where nobody took an image."""
@@ -94,8 +92,7 @@ def comparisons(
             "painted at view time": painted.rgb,
             "confidence": painted.confidence[..., None].expand(-1, -1, 3),
         }
-        truth_rgb = None
-        street = known_street(held_out.scene)
+        truth_rgb, street = None, known_street(held_out.scene)
         if street is not None:
             truth_rgb = street.render(camera, view.timestamp_ns).rgb
         elif shift == Shift():  # nobody took an image elsewhere
@@ -103,9 +100,7 @@ def comparisons(
         compared.append(
             Comparison(
                 title=f"{shift.name}, {view.camera_name}, frame {view.frame_index}",
-                before_label="before painting",
                 before_rgb=before.rgb.clamp(0, 1).cpu(),
-                after_label="after painting",
                 after_rgb=conditions.render_rgb.clamp(0, 1).cpu(),
                 truth_rgb=truth_rgb,
                 inputs={name: rgb.cpu() for name, rgb in inputs.items()},
@@ -120,8 +115,7 @@ def recorded_beside(held_out: HeldOut, fitted: GaussianScene, shift: Shift) -> M
     views = held_out.scene.views_of(held_out.test_views[0].camera_name)
     first = max((len(views) - MOST_MOMENTS) // 2, 0)
     views = views[first : first + MOST_MOMENTS]
-    animation = cv2.Animation()
-    frames = []
+    animation, frames = cv2.Animation(), []
     for view in views:
         camera = held_out.shifted_camera(fitted, view, shift)
         aside = fitted.render(camera, view.timestamp_ns, camera_name=view.camera_name)

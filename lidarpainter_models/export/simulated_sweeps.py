@@ -52,12 +52,7 @@ def simulated_sweeps(
 ) -> Iterator[WrittenSweep]:
     """What a LiDAR would measure, at the times of the log's own sweeps.
 
-    Args:
-        request: which sweeps, by which sensor, from where.
-        log: with its poses as the fit found them.
-        scene: the fit, or a change of it.
-        channel: what was learnt of the log's LiDAR.
-        lidar: the log's own sensor.
+    The log has its poses as the fit found them; the scene is the fit, or a change of it.
 
     Raises:
         SceneError: no sweep is left.

@@ -32,6 +32,7 @@ from lidarpainter_models.export.meshes import joined, obstacle_mesh, ply_bytes
 from lidarpainter_models.export.opendrive import opendrive
 from lidarpainter_models.export.usd_files import MAX_PACKED_BYTES, write_usd
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.lidar.surroundings import Surroundings
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
@@ -79,14 +80,9 @@ class BundleContents:
 
 
 def write_bundle(path: Path, contents: BundleContents) -> dict[str, int]:
-    """Write a bundle.
+    """Write a bundle, and tell the size of every member in bytes.
 
-    Args:
-        path: where the file appears; the caller sees to it that it does so whole.
-        contents: what is written.
-
-    Returns:
-        The size of every member in bytes.
+    The caller sees to it that the file appears whole.
 
     Raises:
         DataError: a member is larger than a .usdz can hold.
@@ -151,16 +147,10 @@ def bundle_metadata(contents: BundleContents) -> dict[str, Any]:
     if envelope is not None:
         least = {f"envelope_{name}": value for name, value in least_of(envelope).items()}
         outputs |= {name: -1.0 if value is None else value for name, value in least.items()}
-        outputs |= {
-            "envelope_good_db": envelope["good_db"],
-            "envelope_promised": envelope["promised"],
-        }
+        outputs |= {f"envelope_{name}": envelope[name] for name in ("good_db", "promised")}
         for number, stretch in enumerate(envelope["stretches"]):
             place = f"envelope_{number:03d}"
-            outputs[f"{place}_from_m"], outputs[f"{place}_to_m"] = (
-                stretch["from_m"],
-                stretch["to_m"],
-            )
+            outputs |= {f"{place}_{name}": stretch[name] for name in ("from_m", "to_m")}
             outputs[f"{place}_confidence"] = stretch["recorded_confidence"]
             outputs |= {
                 f"{place}_{name}": -1.0 if stretch[name] is None else stretch[name]
@@ -192,7 +182,8 @@ def rig_trajectories(contents: BundleContents) -> dict[str, Any]:
     times_ns = torch.cat([frames_ns, torch.tensor([first_us, last_us]) * 1000]).unique()
     rig = driven_road(recorded).driven_on(times_ns)
     ids = {name: f"{name}@{contents.name}" for name in recorded.camera_names}
-    height_m = _height_of_origin(contents)
+    path_m = driven_road(recorded).world_from_body[:, :3, 3].numpy()
+    above_m = path_m[:, 2] - contents.surroundings.ground.everywhere().at(path_m[:, :2])
     calibrations = {
         ids[name]: _calibration(contents, name, number)
         for number, name in enumerate(recorded.camera_names)
@@ -205,7 +196,7 @@ def rig_trajectories(contents: BundleContents) -> dict[str, Any]:
             ids[name]: [_exposure_us(view) for view in recorded.views_of(name)] for name in ids
         },
         "rig_bbox": {
-            "centroid": [RIG_AHEAD_M, 0.0, RIG_SIZE_M[2] / 2 - height_m],
+            "centroid": [RIG_AHEAD_M, 0.0, RIG_SIZE_M[2] / 2 - float(np.median(above_m))],
             "dim": list(RIG_SIZE_M),
             "rot": [0.0, 0.0, 0.0],
         },
@@ -229,7 +220,7 @@ def _calibration(contents: BundleContents, name: str, number: int) -> dict[str, 
             "type": "opencv-pinhole",
             "parameters": {
                 "resolution": [camera.width_px, camera.height_px],
-                "shutter_type": _shutter(contents.recorded.views_of(name)[0]),
+                "shutter_type": shutter_name(camera),
                 "principal_point": [camera.cx_px, camera.cy_px],
                 "focal_length": [camera.fx_px, camera.fy_px],
                 "radial_coeffs": [0.0] * 6,
@@ -245,10 +236,7 @@ def rig_from_camera(
 ) -> Float[Tensor, "4 4"]:
     """Where a camera sits on the car (float64): as in the image in the middle of the log.
 
-    Args:
-        scene: which refines the poses of cameras and of the car.
-        log: as it was recorded.
-        camera_name: a camera of the log.
+    The log is as it was recorded; the scene refines the poses of cameras and of the car.
     """
     views = log.views_of(camera_name)
     view = views[len(views) // 2]
@@ -258,11 +246,11 @@ def rig_from_camera(
     return invert_rigid(rig) @ camera.world_from_camera.double()
 
 
-def _shutter(view: RecordedView) -> str:
+def shutter_name(camera: Camera) -> str:
     """How a camera reads its image, in the words of the interface."""
-    if view.camera.shutter is None or not view.camera.shutter.is_rolling:
+    if camera.shutter is None or not camera.shutter.is_rolling:
         return "GLOBAL"
-    columns_s, rows_s = view.camera.shutter.across_s
+    columns_s, rows_s = camera.shutter.across_s
     if abs(rows_s) >= abs(columns_s):
         return "ROLLING_TOP_TO_BOTTOM" if rows_s > 0 else "ROLLING_BOTTOM_TO_TOP"
     return "ROLLING_LEFT_TO_RIGHT" if columns_s > 0 else "ROLLING_RIGHT_TO_LEFT"
@@ -279,13 +267,6 @@ def _exposures_us(recorded: DrivingScene) -> tuple[int, int]:
     """From the first exposure to the end of the last one."""
     spans = [_exposure_us(view) for view in recorded.views]
     return min(start for start, _ in spans), max(end for _, end in spans)
-
-
-def _height_of_origin(contents: BundleContents) -> float:
-    """How high the rig's origin is above the road."""
-    path_m = driven_road(contents.recorded).world_from_body[:, :3, 3].numpy()
-    above = path_m[:, 2] - contents.surroundings.ground.everywhere().at(path_m[:, :2])
-    return float(np.median(above))
 
 
 def sequence_tracks(contents: BundleContents) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import ConfigError, DataError, MissingPackageError, WriteError
-from lidarpainter_models.export.contents import FRAME, ExportedActor, SceneContents
+from lidarpainter_models.export.contents import FRAME, SceneContents
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.storage.whole_files import whole_file
@@ -103,16 +103,12 @@ def _fill(stage: Any, contents: SceneContents, time: int) -> None:  # noqa: ANN4
         identifier = re.sub(r"\W", "_", actor.actor_id, flags=re.ASCII)
         place = f"/World/Actors/A{index:03d}_{identifier}"
         xform = UsdGeom.Xform.Define(stage, Sdf.Path(place))
-        _describe(xform.GetPrim(), actor)
+        xform.GetPrim().SetCustomDataByKey("actor_id", actor.actor_id)
+        xform.GetPrim().SetCustomDataByKey("category", actor.category)
         translations = poses[:, index, :3, 3].tolist()
         _move(xform, codes, translations, rotations_wxyz[:, index].tolist(), time)
         _show(xform, codes, contents.is_present[:, index].tolist(), time)
         _define_gaussians(stage, f"{place}/Gaussians", actor.gaussians)
-
-
-def _describe(prim: Any, actor: ExportedActor) -> None:  # noqa: ANN401
-    prim.SetCustomDataByKey("actor_id", actor.actor_id)
-    prim.SetCustomDataByKey("category", actor.category)
 
 
 def _move(
@@ -133,12 +129,7 @@ def _move(
         orient.Set(Gf.Quatd(w, x, y, z), code)
 
 
-def _show(
-    xform: Any,  # noqa: ANN401
-    codes: list[float],
-    is_present: list[bool],
-    time: int,
-) -> None:
+def _show(xform: Any, codes: list[float], is_present: list[bool], time: int) -> None:  # noqa: ANN401
     from pxr import UsdGeom
 
     visibility = xform.CreateVisibilityAttr()

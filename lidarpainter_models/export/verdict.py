@@ -25,8 +25,7 @@ TELLING = 0.005
 def verdict(result: Mapping[str, Any]) -> list[str]:
     """Sentences about recorded views, views aside, and actors.
 
-    Args:
-        result: what `reconstruct --json` prints of a run; entries of older runs may lack.
+    `result` is what `reconstruct --json` prints of a run; entries of older runs may lack.
     """
     if (recorded := result.get("recorded")) is None:
         judged = ["Nobody judged this scene: `lidarpainter evaluate` does."]
@@ -40,7 +39,8 @@ def verdict(result: Mapping[str, Any]) -> list[str]:
             _checked(envelope.get(HELD_OUT)),
             _actors(recorded),
         ]
-    sentences = (*judged, _early(result), _taken_back(result.get("gains") or {}))
+    early = "The fit ended early, at its time limit." if result.get("stopped_early") else ""
+    sentences = (*judged, early, _taken_back(result.get("gains") or {}))
     return [sentence for sentence in sentences if sentence]
 
 
@@ -60,10 +60,6 @@ def _recorded(scores: Mapping[str, Any], *, is_even: bool) -> str:
     judged, held_out = scores["num_views"], scores.get("num_held_out", scores["num_views"])
     of_all = "" if judged == held_out else f" of {held_out}"
     return f"{words} ({psnr:.1f} dB over {judged}{of_all} held-out views)."
-
-
-def _early(result: Mapping[str, Any]) -> str:
-    return "The fit ended early, at its time limit." if result.get("stopped_early") else ""
 
 
 def _taken_back(gains: Mapping[str, Mapping[str, Any]]) -> str:

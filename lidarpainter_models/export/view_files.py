@@ -72,13 +72,8 @@ def write_views(
 ) -> tuple[list[list[dict[str, Any]]], float]:
     """Write everything that is wanted of the paths of a rig, moment by moment.
 
-    Args:
-        paths: where to look from, a path for each camera.
-        folders: where the files of each are put.
-        delivery: what is wanted.
-        films: one for each path; none if empty.
-        together: a film that shows all cameras at once.
-        advanced: called after every view.
+    Each path, of one camera, has its folder, and its film if there are `films`; the film
+    `together` shows all cameras at once. `advanced` is called after every view.
 
     Returns:
         By path, where each view was taken, how far it can be trusted, and its files, as JSON; and
@@ -263,7 +258,10 @@ def tiled(
     height_px = min(image.shape[0] for image in images)
     strips = [torch.cat([_as_high(images[one], height_px) for one in row], dim=1) for row in rows]
     width_px = max(strip.shape[1] for strip in strips)
-    return torch.cat([_centred(strip, width_px) for strip in strips])
+    for number, strip in enumerate(strips):
+        lacking = width_px - strip.shape[1]
+        strips[number] = pad(strip, (0, 0, lacking // 2, lacking - lacking // 2))
+    return torch.cat(strips)
 
 
 def _as_high(image: Float[Tensor, "_ _ 3"], height_px: int) -> Float[Tensor, "{height_px} _ 3"]:
@@ -273,10 +271,3 @@ def _as_high(image: Float[Tensor, "_ _ 3"], height_px: int) -> Float[Tensor, "{h
         return image
     size = (max(round(width * height_px / height), 1), height_px)
     return torch.from_numpy(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA))
-
-
-def _centred(
-    strip: Float[Tensor, "height _ 3"], width_px: int
-) -> Float[Tensor, "height {width_px} 3"]:
-    lacking = width_px - strip.shape[1]
-    return pad(strip, (0, 0, lacking // 2, lacking - lacking // 2))

@@ -86,10 +86,6 @@ class ViewRequest:
         if not self.is_painted and (idle := [name for name, is_asked in asked.items() if is_asked]):
             raise ConfigError(f"{idle[0]} needs a painter: --postpaint or --painter")
 
-    def at_width(self, observation: ObservationConfig) -> ObservationConfig:
-        """How images are seen: as the fit saw them, at the width that is asked for."""
-        return replace(observation, width_px=self.width_px or observation.width_px)
-
 
 def followed_paths(
     request: ViewRequest,
@@ -102,13 +98,8 @@ def followed_paths(
 ) -> list[FollowedPath]:
     """What the images of a request are made from, a path for every camera.
 
-    Args:
-        request: where to look from, and whether images are painted.
-        recorded: the recording that the scene was fitted to.
-        builder: the fitted scene, and what is known of its views.
-        fitted_cameras: names of the cameras that the fit saw.
-        observation: how the images of the fit were made.
-        load_painter: gives the painter; called where images are painted.
+    The scene of `builder` was fitted to `recorded`, to images of `fitted_cameras` made as
+    `observation` says; `load_painter` is called where images are painted.
 
     Raises:
         SceneError: the scene has no such camera, or no frame is left.
@@ -118,6 +109,7 @@ def followed_paths(
         followed_views(recorded, name, request.frames)
         for name in followed_cameras(recorded, fitted_cameras, request.camera)
     ]
+    observation = replace(observation, width_px=request.width_px or observation.width_px)
     style = builder.scene.style
     if request.is_painted and style is not None:
         raise ConfigError(
@@ -133,7 +125,7 @@ def followed_paths(
             builder=builder,
             views=views,
             trajectory=request.trajectory,
-            observation=request.at_width(observation),
+            observation=observation,
             painter=_painter(request, builder, load_painter, views[0].camera_name),
             as_rig=len(views_of) > 1,
             evidence=evidence,

@@ -135,26 +135,25 @@ def test_members_are_stored_at_multiples_of_64_bytes(tmp_path):
 def changed_rig(key, value):
     rig = members()["rig_trajectories.json"]
     rig["rig_trajectories"][0][key] = value
-    return rig
+    return {"rig_trajectories.json": rig}
 
 
 def changed_tracks(key, value):
     whole = members()["sequence_tracks.json"]
     whole["s"]["tracks_data"][key] = value
-    return whole
+    return {"sequence_tracks.json": whole}
 
 
-WITHOUT_UUID = {k: v for k, v in members()["metadata.yaml"].items() if k != "uuid"}
+METADATA = members()["metadata.yaml"]
+WITHOUT_UUID = {k: v for k, v in METADATA.items() if k != "uuid"}
+WITHOUT_REACH = METADATA | {"training_step_outputs": {}}
+WITH_HOLE = ply_bytes(square(hole_m=1.0), "m")
+TURNED = [[5, 0, 1, 0, 0, 0, 2]] * 2
 LACKING = [
     ("layer", {"scene.usda": b"#usda 1.0\n"}, "warn", "form of somebody's own"),
     ("layer", {"scene.usda": b"#usda 1.0\n("}, "fail", "cannot be opened"),
     ("metadata", {"metadata.yaml": WITHOUT_UUID}, "fail", "lacks uuid"),
-    (
-        "metadata",
-        {"metadata.yaml": members()["metadata.yaml"] | {"training_step_outputs": {}}},
-        "warn",
-        "how far from its path",
-    ),
+    ("metadata", {"metadata.yaml": WITHOUT_REACH}, "warn", "how far from its path"),
     ("metadata", {"metadata.yaml": b"a: &x [1]\nb: *x\n"}, "fail", "aliases"),
     ("metadata", {"metadata.yaml": b"!!python/object:os.system {}"}, "fail", "is no YAML"),
     ("metadata", {"metadata.yaml": b"[" * 200_000}, "fail", "is no YAML"),
@@ -162,52 +161,17 @@ LACKING = [
     ("rig", {"rig_trajectories.json": b"[" * 100_000}, "fail", "is no JSON"),
     ("rig", {"rig_trajectories.json": None}, "fail", "is missing"),
     ("rig", {"rig_trajectories.json": {}}, "fail", "world_to_nre is missing"),
-    (
-        "rig",
-        {"rig_trajectories.json": changed_rig("T_rig_world_timestamps_us", [0, 200, 100])},
-        "fail",
-        "do not ascend",
-    ),
-    (
-        "rig",
-        {"rig_trajectories.json": changed_rig("T_rig_worlds", [[[10**400] * 4] * 4] * 3)},
-        "fail",
-        "numbers",
-    ),
-    (
-        "rig",
-        {"rig_trajectories.json": changed_rig("T_rig_worlds", [[[2.0] * 4] * 4] * 3)},
-        "fail",
-        "no rotation",
-    ),
-    ("rig", {"rig_trajectories.json": changed_rig("rig_bbox", None)}, "warn", "size of the car"),
-    (
-        "rig",
-        {"rig_trajectories.json": changed_rig("cameras_frame_timestamps_us", {"c@1": [[5, 5]]})},
-        "fail",
-        "ends no later",
-    ),
+    ("rig", changed_rig("T_rig_world_timestamps_us", [0, 200, 100]), "fail", "do not ascend"),
+    ("rig", changed_rig("T_rig_worlds", [[[10**400] * 4] * 4] * 3), "fail", "numbers"),
+    ("rig", changed_rig("T_rig_worlds", [[[2.0] * 4] * 4] * 3), "fail", "no rotation"),
+    ("rig", changed_rig("rig_bbox", None), "warn", "size of the car"),
+    ("rig", changed_rig("cameras_frame_timestamps_us", {"c@1": [[5, 5]]}), "fail", "ends no later"),
     ("tracks", {"sequence_tracks.json": {"a": {}, "b": {}}}, "fail", "expected one sequence"),
-    (
-        "tracks",
-        {"sequence_tracks.json": changed_tracks("tracks_flags", ["NONE"])},
-        "warn",
-        "0 of which may be moved",
-    ),
-    (
-        "tracks",
-        {"sequence_tracks.json": changed_tracks("tracks_poses", [[[5, 0, 1, 0, 0, 0, 2]] * 2])},
-        "fail",
-        "unit quaternions",
-    ),
+    ("tracks", changed_tracks("tracks_flags", ["NONE"]), "warn", "0 of which may be moved"),
+    ("tracks", changed_tracks("tracks_poses", [TURNED]), "fail", "unit quaternions"),
     ("meshes", {"mesh_ground.ply": None}, "fail", "mesh_ground.ply is missing"),
     ("meshes", {"mesh.ply": b"ply\nelement vertex 4000000000\n"}, "fail", "than it has bytes"),
-    (
-        "meshes",
-        {"mesh_ground.ply": ply_bytes(square(hole_m=1.0), "m")},
-        "warn",
-        "widest hole within 1.75 m of it 1.0 m",
-    ),
+    ("meshes", {"mesh_ground.ply": WITH_HOLE}, "warn", "widest hole within 1.75 m of it 1.0 m"),
     ("map", {"map.xodr": None}, "warn", "CARLA has no road"),
     ("map", {"map.xodr": b"<!DOCTYPE a [<!ENTITY b 'c'>]><a/>"}, "fail", "document type"),
     ("map", {"map.xodr": b"<OpenDRIVE/>"}, "fail", "at least one driving lane"),

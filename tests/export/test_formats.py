@@ -14,9 +14,8 @@ DOCS = Path(__file__).parents[2] / "docs" / "exports.md"
 @pytest.mark.parametrize("row", FORMATS, ids=FORMAT_NAMES)
 def test_a_format_is_found_and_loads_its_writer(row):
     assert export_format(row.name) is row
-    assert (row.writer == "") == (
-        row.kind in ("views", "page", "sweeps", "simulated")
-    )  # written view by view
+    is_written_view_by_view = row.kind in ("views", "page", "sweeps", "simulated")
+    assert (row.writer == "") == is_written_view_by_view
     assert not row.writer or callable(row.load_writer())
     reader = row.load_reader()
     assert reader is None or callable(reader)

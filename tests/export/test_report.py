@@ -48,9 +48,7 @@ def sample_report(title: str = "run") -> Report:
     views = [
         Comparison(
             title=f"{name}, front_camera, frame 3",
-            before_label="before painting",
             before_rgb=image,
-            after_label="after painting",
             after_rgb=1 - image,
             truth_rgb=truth,
             inputs=dict.fromkeys(INPUTS, image),
@@ -265,13 +263,8 @@ def test_a_plot_shows_every_line():
 
 
 def test_missing_numbers_print_as_a_dash_and_numbers_shortly():
-    assert [format_cell(value) for value in (None, 1.23456, 123.456, 7, "x")] == [
-        "-",
-        "1.235",
-        "123.5",
-        "7",
-        "x",
-    ]
+    shown = [format_cell(value) for value in (None, 1.23456, 123.456, 7, "x")]
+    assert shown == ["-", "1.235", "123.5", "7", "x"]
 
 
 def test_bytes_round_and_clamp():

@@ -266,31 +266,32 @@ def test_usd_holds_every_number_and_moves_the_actors(world, tmp_path, ending):
         for name in PARAMETERS:
             torch.testing.assert_close(getattr(found, name), getattr(ours, name), atol=1e-5, rtol=0)
     for time in (0, 2, 4):
-        likely, present = scene.actors.refined_poses(times_ns[time])
         code = Usd.TimeCode(times_ns[time] * 1e-9 * TIME_CODES_PER_SECOND)
-        for row, prim in enumerate(actors):
-            xform = UsdGeom.Xformable(prim)
-            pose = torch.from_numpy(np.array(xform.ComputeLocalToWorldTransform(code))).T
-            torch.testing.assert_close(pose, likely[row], atol=1e-5, rtol=0)
-            seen = UsdGeom.Imageable(prim).ComputeVisibility(code)
-            assert (seen == "inherited") == bool(present[row])
+        require_shown(stage, code, scene.actors.refined_poses(times_ns[time]))
+
+
+def require_shown(stage, code, poses):
+    """Actors stand where they should at a time, and are seen if they are there."""
+    from pxr import UsdGeom
+
+    for prim, likely, present in zip(
+        stage.GetPrimAtPath("/World/Actors").GetChildren(), *poses, strict=True
+    ):
+        pose = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(code)
+        pose = torch.from_numpy(np.array(pose)).T
+        torch.testing.assert_close(pose, likely, atol=1e-5, rtol=0)
+        seen = UsdGeom.Imageable(prim).ComputeVisibility(code)
+        assert (seen == "inherited") == bool(present)
 
 
 @pytest.mark.parametrize("time", [0, 3])
 def test_usd_shows_one_moment_to_whoever_asks_for_none(world, tmp_path, time):
-    from pxr import Usd, UsdGeom
+    from pxr import Usd
 
     scene, _, times_ns, contents = world
     write_usd(tmp_path / "a.usdc", contents, time=time)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
-    likely, present = scene.actors.refined_poses(times_ns[time])
-    for row, prim in enumerate(stage.GetPrimAtPath("/World/Actors").GetChildren()):
-        pose = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
-        torch.testing.assert_close(
-            torch.from_numpy(np.array(pose)).T, likely[row], atol=1e-5, rtol=0
-        )
-        seen = UsdGeom.Imageable(prim).ComputeVisibility(Usd.TimeCode.Default())
-        assert (seen == "inherited") == bool(present[row])
+    require_shown(stage, Usd.TimeCode.Default(), scene.actors.refined_poses(times_ns[time]))
 
 
 def test_usd_names_its_endings_and_what_it_needs(world, tmp_path, monkeypatch):
