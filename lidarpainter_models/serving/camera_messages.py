@@ -20,6 +20,7 @@ MOST_TERMS = 24
 """Of a polynomial in one variable."""
 MOST_OF_TWO = 36
 """Of a polynomial in two variables: order 7."""
+TRIANGULAR = {3, 6, 10, 15, 21, 28, MOST_OF_TWO}
 IDENTITY = (1.0, 0.0, 0.0, 1.0)
 
 
@@ -69,12 +70,11 @@ def sensor_camera(spec: Message) -> SensorCamera:
     param = getattr(spec, kind)
     middle = (param.principal_point_x, param.principal_point_y)
     _finite("principal_point", middle)
-    made = {
+    lens, matrix = {
         "opencv_pinhole_param": _pinhole,
         "opencv_fisheye_param": _fisheye,
         "ftheta_param": _ftheta,
     }[kind](param, spec)
-    lens, matrix = made
     return SensorCamera(
         lens=lens,
         pixels_per_unit=matrix,
@@ -133,16 +133,12 @@ def _windshield(spec: Message) -> Windshield | None:
         _terms(name, getattr(param, name), MOST_OF_TWO)
         for name in (f"horizontal_poly{ending}", f"vertical_poly{ending}")
     ]
-    if any(not _is_triangular(len(terms)) for terms in found):
+    if not {len(terms) for terms in found} <= TRIANGULAR:
         raise invalid(
             f"the windshield's {ending or 'forward'} polynomials have {len(found[0])} and "
             f"{len(found[1])} terms: expected 3, 6, 10, 15, 21, 28 or 36"
         )
     return Windshield(horizontal=found[0], vertical=found[1], is_forward=is_forward)
-
-
-def _is_triangular(count: int) -> bool:
-    return count in {n * (n + 1) // 2 for n in range(2, 9)}
 
 
 def _focal(param: Message) -> tuple[float, float, float, float]:

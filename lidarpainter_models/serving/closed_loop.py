@@ -142,21 +142,9 @@ class ClosedLoop:
     """How far to the left of its line the policy is to drive."""
 
     def drive(
-        self,
-        policy: Policy,
-        sensors: Sensors,
-        *,
-        start_ns: int,
-        seconds: float,
+        self, policy: Policy, sensors: Sensors, *, start_ns: int, seconds: float
     ) -> Iterator[Moment]:
-        """Let a policy drive, moment by moment, from where the recording car was at a time.
-
-        Args:
-            policy: who drives.
-            sensors: what its cameras see.
-            start_ns: when the drive begins.
-            seconds: how long it lasts.
-        """
+        """Let a policy drive, moment by moment, from where the recording car was at a time."""
         begin = self.path.driven_on(torch.tensor([start_ns])).world_from_body[0]
         state = self._begun(begin, start_ns)
         rig_from_ground = invert_rigid(self._ground_pose(state)) @ begin
@@ -173,7 +161,17 @@ class ClosedLoop:
             frames = sensors(world_from_rig, time_ns // 1000, placed)
             seen = self._observation(state, number * STEP_S, time_ns, lines, frames)
             acceleration, steering = policy(seen)
-            yield self._moment(state, acceleration, frames, number * STEP_S, time_ns)
+            around, here = self.surroundings, np.array([[state.x_m, state.y_m]])
+            yield Moment(
+                time_s=number * STEP_S,
+                timestamp_ns=time_ns,
+                state=state,
+                acceleration_mps2=acceleration,
+                frames=frames,
+                is_off_road=not bool(around.road.holds(state.wheels_m).all()),
+                is_off_ground=bool(np.isnan(around.ground.at(state.wheels_m)).any()),
+                aside_m=float(np.abs(around.road.line.coordinates(here)[0, 1])),
+            )
             state = state.after(acceleration, steering, STEP_S)
 
     def judged(self, moments: Sequence[Moment]) -> dict[str, Any]:
@@ -301,27 +299,6 @@ class ClosedLoop:
             actors=actors,
             images={name: frame.rgb_u8 for name, frame in frames.items()},
             confidence={name: frame.confidence for name, frame in frames.items()},
-        )
-
-    def _moment(
-        self,
-        state: CarState,
-        acceleration_mps2: float,
-        frames: Mapping[str, SeenFrame],
-        time_s: float,
-        time_ns: int,
-    ) -> Moment:
-        """What is noted of a moment."""
-        here = np.array([[state.x_m, state.y_m]])
-        return Moment(
-            time_s=time_s,
-            timestamp_ns=time_ns,
-            state=state,
-            acceleration_mps2=acceleration_mps2,
-            frames=frames,
-            is_off_road=not bool(self.surroundings.road.holds(state.wheels_m).all()),
-            is_off_ground=bool(np.isnan(self.surroundings.ground.at(state.wheels_m)).any()),
-            aside_m=float(np.abs(self.surroundings.road.line.coordinates(here)[0, 1])),
         )
 
     def _body(self, moments: Sequence[Moment]) -> MovingBody:

@@ -7,7 +7,6 @@ gone. The routes know one scene, which is loaded when it is first asked for.
 
 import base64
 import io
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,10 +15,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, LidarPainterError
+from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track, is_rigid
 from lidarpainter_models.serving.image_formats import Encoding, encoded
 from lidarpainter_models.serving.lens_models import SensorCamera
@@ -28,6 +27,7 @@ from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
 from lidarpainter_models.serving.renderer import Frame, ServedScene
 from lidarpainter_models.serving.trust import metadata
+from lidarpainter_models.serving.wire import listening
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -62,7 +62,6 @@ class ScaleMessage(BaseModel):
 class ImageMessage(BaseModel):
     """One image that is asked for."""
 
-    model_config = ConfigDict(extra="ignore")
     pose: Matrix
     timestamp: Annotated[int, Field(ge=0, lt=2**53)]
     camera_name: str
@@ -208,13 +207,6 @@ def _rigid(rows: list[list[float]], what: str) -> Tensor:
     return pose
 
 
-def raw_bytes(frame: Frame) -> bytes:
-    """An image as neurad-studio sends it: a saved uint8 tensor (height, width, 3) in base64."""
-    file = io.BytesIO()
-    torch.save(torch.from_numpy(frame.rgb_u8), file)
-    return base64.b64encode(file.getvalue())
-
-
 def http_app(scene: HttpScene) -> "FastAPI":
     """The routes of a scene."""
     from fastapi import FastAPI, Request, Response
@@ -232,9 +224,7 @@ def http_app(scene: HttpScene) -> "FastAPI":
     app.get("/get_actors")(scene.actors)
 
     @app.post("/update_actors")
-    def update_actors(
-        actors: Annotated[list[ActorMessage], Field(max_length=MOST_ACTORS)],
-    ) -> None:
+    def update_actors(actors: Annotated[list[ActorMessage], Field(max_length=MOST_ACTORS)]) -> None:
         scene.update(actors)
 
     @app.post("/set_actor_scale")
@@ -245,8 +235,11 @@ def http_app(scene: HttpScene) -> "FastAPI":
     def render_image(message: ImageMessage) -> Response:
         frame = scene.frame(message)
         headers = dict(metadata([frame.trust]))
-        if message.image_format == "raw":
-            return Response(raw_bytes(frame), media_type="text/plain", headers=headers)
+        if message.image_format == "raw":  # a saved uint8 tensor (height, width, 3) in base64
+            file = io.BytesIO()
+            torch.save(torch.from_numpy(frame.rgb_u8), file)
+            data = base64.b64encode(file.getvalue())
+            return Response(data, media_type="text/plain", headers=headers)
         kind, ending = ("png", ".png") if message.image_format == "png" else ("jpeg", ".jpg")
         data = encoded(frame.rgb_u8, Encoding(ending))
         return Response(data, media_type=f"image/{kind}", headers=headers)
@@ -265,21 +258,16 @@ def http_server(
     """
     import uvicorn
 
-    try:
-        listening = socket.create_server((host, port))
-    except OSError:
-        raise ConfigError(
-            f"port {port} of {host} cannot be had: it is in use or not allowed"
-        ) from None
+    socket = listening(host, port)
     app = http_app(HttpScene(scene=scene, queue=queue))
     config = uvicorn.Config(app, log_level="critical", lifespan="off", timeout_graceful_shutdown=0)
     server = uvicorn.Server(config)
-    sockets = {"sockets": [listening]}
+    sockets = {"sockets": [socket]}
     thread = threading.Thread(target=server.run, kwargs=sockets, name="http", daemon=True)
     thread.start()
     try:
-        yield listening.getsockname()[1]
+        yield socket.getsockname()[1]
     finally:
         server.should_exit = True
         thread.join(END_S)
-        listening.close()
+        socket.close()

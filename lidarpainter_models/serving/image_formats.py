@@ -68,18 +68,15 @@ def encoded(rgb_u8: UInt8[np.ndarray, "height width 3"], encoding: Encoding) -> 
 
 
 def encoded_within(
-    rgb_u8: UInt8[np.ndarray, "height width 3"], encoding: Encoding, most_bytes: int | None
+    rgb_u8: UInt8[np.ndarray, "height width 3"], encoding: Encoding, most_bytes: int
 ) -> bytes:
     """An image in an encoding, or as a JPEG that is as good as so many bytes allow.
 
     Raises:
         RequestError: RESOURCE_EXHAUSTED, where no JPEG is small enough.
     """
-    data = encoded(rgb_u8, encoding)
-    if most_bytes is None or len(data) <= most_bytes:
-        return data
-    for quality in FALLING:
-        data = encoded(rgb_u8, Encoding(".jpg", quality))
+    for tried in (encoding, *(Encoding(".jpg", quality) for quality in FALLING)):
+        data = encoded(rgb_u8, tried)
         if len(data) <= most_bytes:
             return data
     raise RequestError(

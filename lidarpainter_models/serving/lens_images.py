@@ -115,10 +115,8 @@ class LensImage:
     def of(cls, camera: SensorCamera, fitted_px: float = 0.0) -> "LensImage":
         """Find the rays of a lens and the faces that they meet.
 
-        Args:
-            camera: The lens.
-            fitted_px: Focal length of the images that Gaussians were fitted to; faces are drawn
-                about as fine, or as they are sampled if that is finer.
+        Faces are drawn about as fine as the images that Gaussians were fitted to, of focal length
+        `fitted_px`, or as they are sampled if that is finer.
         """
         rays, is_seen = camera.pixel_rays()
         seen = rays[is_seen]
@@ -300,9 +298,7 @@ class ReadByLens(PosedScene):
 
 
 def reading_times(
-    camera: SensorCamera,
-    across_s: tuple[float, float],
-    camera_from_face: Float[Tensor, "4 4"],
+    camera: SensorCamera, across_s: tuple[float, float], camera_from_face: Float[Tensor, "4 4"]
 ) -> ReadingTimes:
     """When a lens reads points of a face's frame: by the place of each in the distorted image."""
 

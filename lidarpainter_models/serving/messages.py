@@ -4,7 +4,6 @@ Everything here comes from outside: sizes, numbers and lists are bounded before 
 what makes no sense is refused in one line that names the field.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.export.simulator_bundle import shutter_name
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
@@ -129,12 +129,15 @@ def read_request(message: Message) -> SensorRequest:
             f"the request has {width_px} x {height_px} px through a lens whose rays are searched "
             f"for: expected at most {MOST_SEARCHED} px"
         )
+    own_body_of = None
+    if message.insert_ego_mask:
+        own_body_of = message.ego_mask_id.camera_logical_id or spec.logical_id
     return SensorRequest(
         **read_timed(message),
         camera_name=spec.logical_id,
         camera=camera,
         across=_ACROSS[spec.shutter_type],
-        own_body_of=_own_body_of(message),
+        own_body_of=own_body_of,
         encoding=encoding_of(message.image_format, message.image_quality),
     )
 
@@ -160,27 +163,17 @@ def read_timed(message: Message) -> dict[str, Any]:
     ids = tuple(one.track_id for one in message.dynamic_objects)
     pairs = [(f"dynamic object {one.track_id!r}", one.pose_pair) for one in message.dynamic_objects]
     poses = _poses([("sensor_pose", message.sensor_pose), *pairs])
+    if len(set(ids)) < len(ids):
+        twice = next(name for index, name in enumerate(ids) if name in ids[:index])
+        raise invalid(f"dynamic object {twice!r} is there twice")
     return {
         "scene_id": message.scene_id,
         "start_us": start_us,
         "end_us": end_us,
         "world_from_sensor": poses[0],
-        "actor_ids": _each_once(ids),
+        "actor_ids": ids,
         "world_from_actors": poses[1:],
     }
-
-
-def _own_body_of(message: Message) -> str | None:
-    if not message.insert_ego_mask:
-        return None
-    return message.ego_mask_id.camera_logical_id or message.camera_intrinsics.logical_id
-
-
-def _each_once(ids: tuple[str, ...]) -> tuple[str, ...]:
-    if len(set(ids)) < len(ids):
-        twice = next(name for index, name in enumerate(ids) if name in ids[:index])
-        raise invalid(f"dynamic object {twice!r} is there twice")
-    return ids
 
 
 def _poses(pairs: Sequence[tuple[str, Message]]) -> Float[Tensor, "pairs 2 4 4"]:
@@ -259,14 +252,11 @@ def trajectory_message(
 
 def camera_message(name: str, camera: Camera) -> Message:
     """The lens of a camera as a message."""
-    across_s = (0.0, 0.0) if camera.shutter is None else camera.shutter.across_s
-    across = tuple(math.copysign(1.0, each) if each else 0.0 for each in across_s)
-    shutter = next(kind for kind, one in _ACROSS.items() if one == across and kind)
     return sensorsim_pb2.CameraSpec(
         logical_id=name,
         resolution_w=camera.width_px,
         resolution_h=camera.height_px,
-        shutter_type=sensorsim_pb2.GLOBAL if not any(across) else shutter,
+        shutter_type=getattr(sensorsim_pb2, shutter_name(camera)),
         opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
             principal_point_x=camera.cx_px,
             principal_point_y=camera.cy_px,

@@ -51,12 +51,7 @@ class PaintedStreams:
         return partial(self._paint, moment, shown, client)
 
     def _paint(
-        self,
-        moment: Moment,
-        builder: ConditionBuilder,
-        client: str,
-        face: str,
-        camera: Camera,
+        self, moment: Moment, builder: ConditionBuilder, client: str, face: str, camera: Camera
     ) -> Float[Tensor, "height width 3"]:
         conditions = builder.conditions(camera, moment.timestamp_ns, camera_name=moment.camera_name)
         with self._lock:  # frames of a stream lean on each other, and the painter has all threads

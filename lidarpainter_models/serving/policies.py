@@ -123,7 +123,9 @@ def checked(policy: Callable[[Observation], object], name: str) -> Policy:
 
 def lane_keep(seen: Observation) -> tuple[float, float]:
     """Keep to the middle of the lane, as fast as the recording car was at its fastest."""
-    return _towards(seen.desired_speed_mps, seen), pure_pursuit(seen, seen.lane_m)
+    wanted = SPEED_GAIN_PER_S * (seen.desired_speed_mps - seen.speed_mps)
+    acceleration_mps2 = min(max(wanted, -2 * BRAKING_MPS2), COMFORT_MPS2)
+    return acceleration_mps2, pure_pursuit(seen, seen.lane_m)
 
 
 def follow_log(seen: Observation) -> tuple[float, float]:
@@ -135,19 +137,15 @@ def follow_log(seen: Observation) -> tuple[float, float]:
 def follow_lead(seen: Observation) -> tuple[float, float]:
     """Keep to the lane and behind whoever is in front: the intelligent driver model."""
     gap_m, lead_mps = lead_of(seen)
-    return idm_mps2(seen.speed_mps, seen.desired_speed_mps, gap_m, lead_mps), pure_pursuit(
-        seen, seen.lane_m
-    )
+    acceleration_mps2 = idm_mps2(seen.speed_mps, seen.desired_speed_mps, gap_m, lead_mps)
+    return acceleration_mps2, pure_pursuit(seen, seen.lane_m)
 
 
 def idm_mps2(speed_mps: float, desired_mps: float, gap_m: float, lead_mps: float) -> float:
     """Acceleration of the intelligent driver model, Treiber et al. (2000).
 
-    Args:
-        speed_mps: own speed.
-        desired_mps: on a free road.
-        gap_m: to the one in front, bumper to bumper; infinite where there is none.
-        lead_mps: its speed.
+    The speed is desired on a free road; the gap is that to the one in front, bumper to bumper,
+    infinite where there is none.
     """
     free = (speed_mps / max(desired_mps, 0.1)) ** EXPONENT
     closing_mps = speed_mps - lead_mps
@@ -165,7 +163,11 @@ def pure_pursuit(seen: Observation, line_m: Float[np.ndarray, "samples 2"]) -> f
     here = np.asarray(seen.position_m)
     nearest = int(np.linalg.norm(line_m - here, axis=1).argmin())
     beyond = np.linalg.norm(line_m[nearest:] - here, axis=1) >= reach_m
-    target = line_m[nearest + int(beyond.argmax())] if beyond.any() else _past(line_m, reach_m)
+    if beyond.any():
+        target = line_m[nearest + int(beyond.argmax())]
+    else:  # straight on past the end of the line
+        ahead = line_m[-1] - line_m[-2]
+        target = line_m[-1] + reach_m * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
     away = target - here
     bearing_rad = math.atan2(away[1], away[0]) - seen.yaw_rad
     distance_m = max(float(np.linalg.norm(away)), 0.1)
@@ -188,17 +190,6 @@ def lead_of(seen: Observation) -> tuple[float, float]:
 
 def _travelled(line_m: Float[np.ndarray, "samples 2"]) -> Float[np.ndarray, " samples"]:
     return np.append(0.0, np.linalg.norm(np.diff(line_m, axis=0), axis=1).cumsum())
-
-
-def _past(line_m: Float[np.ndarray, "samples 2"], reach_m: float) -> Float[np.ndarray, "2"]:
-    """A point straight on past the end of a line."""
-    ahead = line_m[-1] - line_m[-2]
-    return line_m[-1] + reach_m * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-
-
-def _towards(wanted_mps: float, seen: Observation) -> float:
-    wanted = SPEED_GAIN_PER_S * (wanted_mps - seen.speed_mps)
-    return min(max(wanted, -2 * BRAKING_MPS2), COMFORT_MPS2)
 
 
 def changed_lane(

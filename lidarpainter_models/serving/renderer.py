@@ -131,11 +131,7 @@ class ServedScene:
         return other
 
     def frame(self, request: SensorRequest, client: str = "") -> Frame:
-        """The image that a request asks for.
-
-        Args:
-            request: what is asked for.
-            client: who asks; frames of one client and camera are painted in agreement.
+        """The image that a request asks for; a client's frames of a camera are painted to agree.
 
         Raises:
             RequestError: OUT_OF_RANGE: the scene knows nothing of that time; INVALID_ARGUMENT: it
@@ -147,7 +143,7 @@ class ServedScene:
             painter = self.streams.painter(moment, self.builder, client)
         rgb, trust = both(
             partial(self._image, request, moment, painter),
-            partial(self.trust, request, moment),
+            partial(self._trust, request, moment),
             self.scene.device,
         )
         if request.own_body_of is not None:
@@ -155,9 +151,8 @@ class ServedScene:
         rgb_u8 = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         return Frame(rgb_u8=rgb_u8, trust=trust)
 
-    def trust(self, request: SensorRequest, moment: Moment | None = None) -> Trust:
+    def _trust(self, request: SensorRequest, moment: Moment) -> Trust:
         """How far the image of a request can be trusted, before anybody paints it."""
-        moment = self._moment(request) if moment is None else moment
         distance_m = None
         if self.envelope is not None:
             distance_m = self._distance(request.camera_name).of(moment.world_from_camera)
@@ -172,10 +167,14 @@ class ServedScene:
             confidence=found.confidence, predicted_db=found.predicted_db, distance_m=distance_m
         )
 
-    def found(self, view: RecordedView, camera: Camera | None = None) -> Camera:
-        """A recorded view's camera where the fit found it, at recorded size or another one."""
-        taken = view.camera if camera is None else camera
-        return found_camera(self.scene, self.recorded, view, taken)
+    def found(self, view: RecordedView) -> Camera:
+        """A recorded view's camera where the fit found it, at recorded size.
+
+        It is kept: every client asks for recorded moments again and again.
+        """
+        if view.key not in self._found:
+            self._found[view.key] = found_camera(self.scene, self.recorded, view, view.camera)
+        return self._found[view.key]
 
     def refuse_other_times(self, request: TimedRequest) -> None:
         """Refuse a span of time of which the scene knows nothing.
@@ -225,18 +224,12 @@ class ServedScene:
         view = views[int((times_ns - request.middle_ns).abs().argmin())]
         if abs(view.timestamp_ns - request.middle_ns) > SAME_TIME_NS:
             return None
-        camera = self._found_view(view).resized(
+        camera = self.found(view).resized(
             width_px=request.camera.width_px, height_px=request.camera.height_px
         )
         if not bool(same_pose(middle, camera.world_from_camera.double())):
             return None
         return (view, camera) if reads_alike(request, camera) else None
-
-    def _found_view(self, view: RecordedView) -> Camera:
-        """As `found`, kept: every client asks for recorded moments again and again."""
-        if view.key not in self._found:
-            self._found[view.key] = self.found(view)
-        return self._found[view.key]
 
     def _views_of(self, name: str) -> tuple[tuple[RecordedView, ...], Int[Tensor, " views"]]:
         """The recorded views of a camera, and when they were taken."""
@@ -287,7 +280,8 @@ class ServedScene:
         with self._lock:
             if camera not in self._lenses:
                 self._lenses[camera] = LensImage.of(camera, self._fitted_px)
-                while len(self._lenses) > 1 and self._num_rays() > MOST_RAYS:
+                kept = self._lenses.values()
+                while len(kept) > 1 and sum(one.is_seen.numel() for one in kept) > MOST_RAYS:
                     self._lenses.popitem(last=False)
             self._lenses.move_to_end(camera)
             return self._lenses[camera]
@@ -296,9 +290,6 @@ class ServedScene:
     def _fitted_px(self) -> float:
         """Focal length of the images that the scene was fitted to: the middle one of all views."""
         return float(np.median([view.camera.fx_px for view in self.builder.training_views]))
-
-    def _num_rays(self) -> int:
-        return sum(each.is_seen.numel() for each in self._lenses.values())
 
     def _looked_at(self, request: SensorRequest, moment: Moment) -> Camera:
         """A pinhole that sees what an image shows, or the middle part of it.

@@ -24,10 +24,7 @@ from lidarpainter_models.serving.protos import Message, sensorsim_pb2
 from lidarpainter_models.serving.refusals import RequestError, invalid
 from lidarpainter_models.serving.renderer import ServedScene
 
-SENSORS = {
-    sensorsim_pb2.PANDAR128: PRESETS["pandar128"],
-    sensorsim_pb2.AT128: PRESETS["at128"],
-}
+SENSORS = {sensorsim_pb2.PANDAR128: PRESETS["pandar128"], sensorsim_pb2.AT128: PRESETS["at128"]}
 """By the numbers of `LidarDeviceType`."""
 LIKELY_LOST = 0.5
 """Chance from which on a ray is lost, unless the request says another."""

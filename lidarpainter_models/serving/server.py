@@ -5,7 +5,6 @@ those of the first with another package, in a pool of descriptors of their own: 
 alike.
 """
 
-import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING
 from google.protobuf import descriptor_pb2, text_format
 from google.protobuf.descriptor_pool import DescriptorPool
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.servicer import SensorsimServicer, answering
 from lidarpainter_models.serving.wire import (
@@ -22,6 +20,7 @@ from lidarpainter_models.serving.wire import (
     PACKAGES,
     grpc_package,
     handlers,
+    listening,
     service_names,
 )
 
@@ -52,7 +51,7 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
     state = health.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(state, server)
     _add_reflection(server)
-    _check_port(host, port)
+    listening(host, port).close()  # gRPC would write lines of its own about a port it cannot have
     bound = server.add_insecure_port(f"{host}:{port}")
     for name in ("", *service_names()):
         state.set(name, health_pb2.HealthCheckResponse.SERVING)
@@ -64,16 +63,6 @@ def grpc_server(servicer: SensorsimServicer, *, host: str, port: int) -> Iterato
         servicer.queue.close()
         server.stop(GRACE_S).wait(2 * GRACE_S)
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _check_port(host: str, port: int) -> None:
-    """Refuse a port that cannot be had; gRPC would write lines of its own about it."""
-    try:
-        socket.create_server((host, port)).close()
-    except OSError:
-        raise ConfigError(
-            f"port {port} of {host} cannot be had: it is in use or not allowed"
-        ) from None
 
 
 def described_services() -> Message:

@@ -4,26 +4,28 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 
 import lidarpainter_models
 from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.export.simulator_bundle import rig_from_camera
 from lidarpainter_models.kernels.side_by_side import side_by_side
-from lidarpainter_models.serving import scene_messages
 from lidarpainter_models.serving.image_formats import encoded_within
-from lidarpainter_models.serving.messages import SensorRequest, read_request
+from lidarpainter_models.serving.messages import (
+    SensorRequest,
+    camera_message,
+    pose_message,
+    read_request,
+    trajectory_message,
+)
 from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
 from lidarpainter_models.serving.refusals import Code, RequestError, invalid
 from lidarpainter_models.serving.render_queue import RenderQueue
-from lidarpainter_models.serving.renderer import ServedScene
 from lidarpainter_models.serving.scene_pool import ScenePool
-from lidarpainter_models.serving.served_sweeps import (
-    measured_points,
-    points_message,
-    read_sweep,
-)
+from lidarpainter_models.serving.served_sweeps import measured_points, points_message, read_sweep
 from lidarpainter_models.serving.trust import Trust, metadata
 from lidarpainter_models.serving.wire import MOST_BYTES, grpc_package
 
@@ -73,15 +75,6 @@ def answering(answer: Callable[..., Message]) -> Callable[..., Message]:
         except Exception as error:  # noqa: BLE001 - a client gets a line, the server goes on
             code, why = "INTERNAL", f"unexpected {type(error).__name__}: {error}".splitlines()[0]
         return context.abort(getattr(grpc_package().StatusCode, code), why)
-
-    return call
-
-
-def _told_of(tell: Callable[[ServedScene], Message]) -> Callable[..., Message]:
-    """A call that asks what is known of a scene."""
-
-    def call(self: "SensorsimServicer", message: Message, _context: "ServicerContext") -> Message:
-        return tell(self.scenes.get(message.scene_id))
 
     return call
 
@@ -158,14 +151,49 @@ class SensorsimServicer:
             reply.scenes.add(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
         return reply
 
-    get_available_cameras = _told_of(scene_messages.cameras)
-    get_available_trajectories = _told_of(scene_messages.trajectories)
-    get_dynamic_objects = _told_of(scene_messages.dynamic_objects)
+    def get_available_cameras(self, message: Message, _context: "ServicerContext") -> Message:
+        """Every recorded camera: its lens without distortion, and where it sits in the car."""
+        served, reply = self.scenes.get(message.scene_id), sensorsim_pb2.AvailableCamerasReturn()
+        for name in served.recorded.camera_names:
+            views = served.recorded.views_of(name)
+            reply.available_cameras.add(
+                intrinsics=camera_message(name, served.found(views[len(views) // 2])),
+                rig_to_camera=pose_message(rig_from_camera(served.scene, served.recorded, name)),
+                logical_id=name,
+            )
+        return reply
+
+    def get_available_trajectories(self, message: Message, _context: "ServicerContext") -> Message:
+        """The way of the car where the sweeps say that it drove, at the times of its frames."""
+        served = self.scenes.get(message.scene_id)
+        car = served.recorded.corrected(served.scene.cameras.path)
+        reply = sensorsim_pb2.AvailableTrajectoriesReturn()
+        way = trajectory_message(car.frame_timestamps_ns.tolist(), car.world_from_ego)
+        reply.available_trajectories.add(trajectory=way)
+        return reply
+
+    def get_dynamic_objects(self, message: Message, _context: "ServicerContext") -> Message:
+        """Every actor with its poses: those that can be moved, and those that are parked."""
+        served, reply = self.scenes.get(message.scene_id), sensorsim_pb2.DynamicObjectsReturn()
+        for track in (*served.scene.tracks, *served.parked.values()):
+            length_m, width_m, height_m = track.size_m.tolist()
+            reply.dynamic_objects.add(
+                id=track.actor_id,
+                semantic_class=track.category,
+                trajectory=trajectory_message(track.timestamps_ns.tolist(), track.world_from_box),
+                object_size=common_pb2.AABB(size_x=length_m, size_y=width_m, size_z=height_m),
+            )
+        return reply
 
     def get_available_ego_masks(self, _message: Message, _context: "ServicerContext") -> Message:
+        """The cameras that show the recording car itself."""
         reply = sensorsim_pb2.AvailableEgoMasksReturn()
-        for name in self.scenes.announced:
-            scene_messages.add_ego_masks(reply, name, self.scenes.get(name))
+        for scene_id in self.scenes.announced:
+            bodies = self.scenes.get(scene_id).scene.cameras.own_bodies
+            for name, body in sorted(bodies.items()):
+                if bool(torch.as_tensor(body).any()):
+                    mask = sensorsim_pb2.EgoMaskId(camera_logical_id=name, rig_config_id=scene_id)
+                    reply.ego_mask_metadata.add(ego_mask_id=mask)
         return reply
 
     def get_server_config(self, _message: Message, _context: "ServicerContext") -> Message:
@@ -223,8 +251,9 @@ class SensorsimServicer:
             client,
             self.scenes.num_changes(),
         )
+        drawn = partial(self._drawn, share=share, client=client)
         found = self.queue.answer(
-            key, lambda: self._draw(messages, share, client), context.time_remaining()
+            key, lambda: list(side_by_side(drawn, messages, self.device)), context.time_remaining()
         )
         context.set_trailing_metadata(metadata([made.trust for made in found]))
         if sum(len(made.data) for made in found) > most_bytes:
@@ -235,13 +264,7 @@ class SensorsimServicer:
             )
         return found
 
-    def _draw(self, messages: Sequence[Message], share: int, client: str) -> list[_Made]:
-        def draw(message: Message) -> _Made:
-            return self._drawn(message, share, client)
-
-        return list(side_by_side(draw, messages, self.device))
-
-    def _drawn(self, message: Message, share: int, client: str) -> _Made:
+    def _drawn(self, message: Message, *, share: int, client: str) -> _Made:
         begun, request, made = time.perf_counter(), None, _Made()
         try:
             request = read_request(message)

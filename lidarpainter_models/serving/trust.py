@@ -61,17 +61,13 @@ class EnvelopeDistance:
         self._centres = torch.stack([view.camera.centre_world.double() for view in views])
         self._ego_from_world = invert_rigid(cars.double())[:, :3, :3]
         stretches = envelope["stretches"]
-        rows = [
-            next(
-                (one for one in stretches if one["first_frame"] <= index <= one["last_frame"]),
-                None,
-            )
+        rows: list[Mapping[str, Any]] = [
+            next((one for one in stretches if one["first_frame"] <= index <= one["last_frame"]), {})
             for index in frame_indices
         ]
         names = ("left_m", "right_m", "up_m", "ahead_m")
         self._reach_m = torch.tensor(
-            [[(row or {}).get(name) or 0.0 for name in names] for row in rows],
-            dtype=torch.float64,
+            [[row.get(name) or 0.0 for name in names] for row in rows], dtype=torch.float64
         )
 
     def of(self, world_from_camera: Float[Tensor, "4 4"]) -> float:
@@ -81,12 +77,9 @@ class EnvelopeDistance:
         ahead, left, up = (self._ego_from_world[nearest] @ aside[nearest]).tolist()
         left_m, right_m, up_m, ahead_m = self._reach_m[nearest].tolist()
         is_end = nearest == len(self._centres) - 1
-        gap = self._gap_m(nearest)
+        beside = self._centres[max(nearest - 1, 0) : nearest + 2]
+        # half way to the next recorded place, at most: so far along counts as on the path
+        gap = float(beside.diff(dim=0).norm(dim=1).max()) if len(beside) > 1 else 0.0
         along = max(ahead - (ahead_m if is_end else gap), -ahead - gap, 0.0)
         across = max(left - left_m, -left - right_m, 0.0)
         return math.hypot(along, across, max(up - up_m, -up - up_m, 0.0))
-
-    def _gap_m(self, nearest: int) -> float:
-        """Half way to the next recorded place, at most: so far along counts as on the path."""
-        beside = self._centres[max(nearest - 1, 0) : nearest + 2]
-        return float(beside.diff(dim=0).norm(dim=1).max()) if len(beside) > 1 else 0.0

@@ -4,12 +4,15 @@ Clients of different age know the service by different package names; messages a
 same, so one servicer answers under all of them.
 """
 
+import socket
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from lidarpainter_models.errors import MissingPackageError
-from lidarpainter_models.serving.protos import Message, common_pb2, sensorsim_pb2
+from google.protobuf.message_factory import GetMessageClass
+
+from lidarpainter_models.errors import ConfigError, MissingPackageError
+from lidarpainter_models.serving.protos import Message, sensorsim_pb2
 
 if TYPE_CHECKING:
     import grpc
@@ -38,6 +41,20 @@ def grpc_package() -> Any:  # noqa: ANN401  a module
     return grpc
 
 
+def listening(host: str, port: int) -> socket.socket:
+    """A socket that listens; port 0 is any.
+
+    Raises:
+        ConfigError: the port cannot be had.
+    """
+    try:
+        return socket.create_server((host, port))
+    except OSError:
+        raise ConfigError(
+            f"port {port} of {host} cannot be had: it is in use or not allowed"
+        ) from None
+
+
 def service_names() -> tuple[str, ...]:
     """The full names that the service answers to."""
     return tuple(f"{package}.{SERVICE}" for package in PACKAGES)
@@ -47,14 +64,9 @@ def calls() -> dict[str, tuple[Any, Any]]:
     """Of every call its message and that of its reply."""
     found = sensorsim_pb2.DESCRIPTOR.services_by_name[SERVICE].methods
     return {
-        method.name: (_class_of(method.input_type), _class_of(method.output_type))
+        method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
         for method in found
     }
-
-
-def _class_of(descriptor: Message) -> Message:
-    module = common_pb2 if descriptor.file is common_pb2.DESCRIPTOR else sensorsim_pb2
-    return getattr(module, descriptor.name)
 
 
 def handlers(

@@ -8,6 +8,7 @@ from served_street import served
 from spoilt_messages import lenses, spoilt
 
 from lidarpainter_models.serving import wire
+from lidarpainter_models.serving.protos import common_pb2
 from lidarpainter_models.serving.protos import sensorsim_pb2 as pb
 
 REFUSALS = {
@@ -91,4 +92,4 @@ def test_bytes_that_are_no_message_are_refused(channel, client):
     for data in (b"\xff" * 100, bytes(range(256)), b"\x0a\xff\xff\xff\xff\x0f"):
         with pytest.raises(grpc.RpcError):
             call(data, timeout=60)
-    assert client.get_version(wire.common_pb2.Empty(), timeout=60).version_id
+    assert client.get_version(common_pb2.Empty(), timeout=60).version_id

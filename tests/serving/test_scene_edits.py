@@ -74,24 +74,14 @@ def test_an_actor_that_is_replaced_looks_otherwise_and_keeps_its_name(street, cl
 def test_an_edit_that_cannot_be_done_changes_nothing_and_says_why(street, client, view):
     name = street.scene.actors.recorded_tracks[0].actor_id
     good = street.insertion(view, "newcomer")
+    replaced, track, way = pb.ReplaceAssetAction, pb.DynamicObjectTrack, good.insert[0].trajectory
+    no_size = common_pb2.AABB(size_x=float("nan"), size_y=2, size_z=1)
     cases = {
-        "'nobody'": {"replace": [pb.ReplaceAssetAction(original_id="nobody")]},
-        "'strange'": {
-            "replace": [pb.ReplaceAssetAction(original_id=name, replacement_id="strange")]
-        },
-        "there already": {
-            "insert": [pb.DynamicObjectTrack(id=name, trajectory=good.insert[0].trajectory)]
-        },
-        "1 to 4096 poses": {"insert": [pb.DynamicObjectTrack(id="b")]},
-        "object_size nan": {
-            "insert": [
-                pb.DynamicObjectTrack(
-                    id="c",
-                    trajectory=good.insert[0].trajectory,
-                    object_size=common_pb2.AABB(size_x=float("nan"), size_y=2, size_z=1),
-                )
-            ]
-        },
+        "'nobody'": {"replace": [replaced(original_id="nobody")]},
+        "'strange'": {"replace": [replaced(original_id=name, replacement_id="strange")]},
+        "there already": {"insert": [track(id=name, trajectory=way)]},
+        "1 to 4096 poses": {"insert": [track(id="b")]},
+        "object_size nan": {"insert": [track(id="c", trajectory=way, object_size=no_size)]},
     }
     for words, fields in cases.items():
         message = pb.EditAssetsRequest(**SCENE, **fields)

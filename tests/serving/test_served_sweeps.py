@@ -113,14 +113,12 @@ def test_a_filter_leaves_out_what_it_says(street, swept, sweep):
     [
         ({"raydrop_threshold": float("nan")}, "raydrop_threshold nan"),
         ({"opacity_threshold": 2.0}, "opacity_threshold 2"),
-        (
-            {"enable_distance_filter": True, "distance_filter_threshold": -1.0},
-            "distance_filter_threshold -1",
-        ),
+        ({"distance_filter_threshold": -1.0}, "distance_filter_threshold -1"),
     ],
 )
 def test_a_filter_that_makes_no_sense_is_refused(street, sweep, changes, expected):
     message = asked(street, sweep)
+    message.render_filter.enable_distance_filter = "distance_filter_threshold" in changes
     for name, value in changes.items():
         setattr(message.render_filter, name, value)
     with pytest.raises(RequestError, match=expected):
