@@ -4,12 +4,11 @@ Any page that a browser has open may connect to this machine, so what other page
 own ask is refused.
 """
 
-import contextlib
 import io
 import re
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from http import HTTPStatus
 from typing import Any
@@ -47,7 +46,7 @@ def local_server(*, label: str = "", port: int | None = None) -> Iterator[LocalS
             keep other pages out.
     """
     asked_port = FIRST_PORT if port is None else port
-    with _silence(), _own_pages_only() as served:
+    with redirect_stdout(io.StringIO()), _own_pages_only() as served:
         server = LocalServer(HOST, asked_port, label, verbose=False)
     try:
         if not served.is_set():
@@ -56,7 +55,7 @@ def local_server(*, label: str = "", port: int | None = None) -> Iterator[LocalS
             raise ConfigError(f"port {port} of {HOST} cannot be had: it is in use or not allowed")
         yield server
     finally:
-        with _silence():  # it says goodbye on stdout, where a command's JSON stands
+        with redirect_stdout(io.StringIO()):  # where a command's JSON stands, it says goodbye
             server.stop()
 
 
@@ -103,9 +102,3 @@ def _is_own_page(headers: Headers) -> bool:
     origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
     is_here = all(THIS_MACHINE.fullmatch(host) for host in hosts)
     return is_here and origins in ([], [f"http://{host}" for host in hosts])
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

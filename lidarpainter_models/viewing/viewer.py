@@ -6,10 +6,11 @@ under one lock.
 
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
 import torch
 import viser
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.export.images import to_bytes
 from lidarpainter_models.geometry.boxes import first_box_hit
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.shifts import MAX_SHIFT_M
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import (
     invert_rigid,
@@ -28,7 +30,6 @@ from lidarpainter_models.geometry.transforms import (
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes, plain
-from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, Controls
 from lidarpainter_models.viewing.drive_nodes import (
     ROOT,
     DriveNodes,
@@ -42,6 +43,55 @@ FRUSTUM_PX = 240
 """Width of a recorded image in its frustum."""
 PAUSED_S = 0.1
 """How often a standing viewer looks whether it is to play."""
+RECORDED, ASIDE, FREE = SEATS = ("recorded", "aside", "free")
+"""Recorded and aside ride along; free stays in the world where it was."""
+SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
+LOWEST_M = -1.0
+"""The seat may be lowered so far."""
+CLICK_HINT = "Click on an actor to see what it is."
+
+
+class Controls:
+    """The panel: every control, to be read and written."""
+
+    def __init__(
+        self, gui: viser.GuiApi, *, num_moments: int, scenes: Sequence[str], has_sweeps: bool
+    ) -> None:
+        """Put the panel together."""
+        nothing = np.full((9, 16, 3), 255, np.uint8)
+        time, seat, shown = (gui.add_folder(title) for title in ("Time", "Seat", "Shown"))
+        own = gui.add_folder("The same view by our own renderer")
+        with time:
+            self.moment = gui.add_slider("moment", 0, max(num_moments - 1, 1), 1, 0)
+            self.play = gui.add_checkbox("play", initial_value=False)
+            self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
+        with seat:
+            self.seat = gui.add_dropdown("seat", SEATS, initial_value=RECORDED)
+            self.left_m = gui.add_slider("left, m", -MAX_SHIFT_M, MAX_SHIFT_M, 0.25, 2.0)
+            self.up_m = gui.add_slider("up, m", LOWEST_M, MAX_SHIFT_M, 0.25, 0.0)
+            self.straighten = gui.add_button("look straight ahead")
+        with shown:
+            self.scene = gui.add_dropdown("scene", tuple(scenes), initial_value=scenes[0])
+            self.actors, self.boxes, self.tracks, self.cameras, self.lidar = (
+                gui.add_checkbox(name, initial_value=name == "actors")
+                for name in ("actors", "boxes", "tracks", "cameras", "LiDAR")
+            )
+            self.simulated = gui.add_checkbox(
+                "LiDAR as simulated", initial_value=False, visible=has_sweeps
+            )
+            self.picked = gui.add_markdown(CLICK_HINT)
+        with own:
+            self.painted = gui.add_checkbox("painted", initial_value=False)
+            self.render = gui.add_button("render")
+            self.own_image = gui.add_image(nothing, visible=False)
+
+    def on_change(self, shown: Callable[[], None]) -> None:
+        """Call back whenever something changed that decides what is shown."""
+        for control in (
+            *(self.moment, self.seat, self.left_m, self.up_m, self.scene),
+            *(self.actors, self.boxes, self.tracks, self.cameras, self.lidar, self.simulated),
+        ):
+            control.on_update(lambda _event: shown())
 
 
 class LiveViewer:
@@ -147,7 +197,7 @@ class LiveViewer:
     def _place_rig(self, frame_index: int) -> None:
         path, scene = self._drive.path, self._drive.path.builder.scene
         size = replace(path.observation, width_px=FRUSTUM_PX)
-        in_the_way = self._drive.camera_name if self.controls.seat.value == "recorded" else None
+        in_the_way = self._drive.camera_name if self.controls.seat.value == RECORDED else None
         there = []
         for view in path.recorded.views:
             if view.frame_index != frame_index:

@@ -24,10 +24,9 @@ from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_fro
 from lidarpainter_models.viewing import servers
 from lidarpainter_models.viewing import watching as viewing_settings
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
-from lidarpainter_models.viewing.controls import CLICK_HINT
 from lidarpainter_models.viewing.drive_nodes import SEAT_FROM_CAMERA
 from lidarpainter_models.viewing.servers import local_server
-from lidarpainter_models.viewing.viewer import LiveViewer
+from lidarpainter_models.viewing.viewer import CLICK_HINT, LiveViewer
 from lidarpainter_models.viewing.watching import Watch
 from tasks.progress import ProgressListener, listening
 from tasks.reconstruction.fit import fit
