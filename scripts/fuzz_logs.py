@@ -35,7 +35,6 @@ from lidarpainter_models.scenes.rewriting import header_of
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.scenes.writer import SceneWriter
 from lidarpainter_models.stress.frames import read_frame
-from lidarpainter_models.stress.spoiling import write_frame
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigLidar
 from tasks.ingest.data_checks import findings_about
 
@@ -264,7 +263,7 @@ def _rewritten(scene: DrivingScene, store: Path, name: str, changes: Sequence[Ch
             frame = read_frame(scene, frame_index)
             for change in changes:
                 frame = change(frame)
-            write_frame(writer, frame)
+            frame.write(writer)
     return writer.path
 
 

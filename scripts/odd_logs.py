@@ -109,7 +109,7 @@ def _with_images(change: Callable[[np.ndarray, Frame], np.ndarray]) -> Change:
     """Pixels of each image changed in place or anew."""
     return lambda frame: replace(
         frame,
-        shots=tuple(shot.with_pixels(lambda bgr: change(bgr, frame)) for shot in frame.shots),
+        images=tuple(shot.with_pixels(lambda bgr: change(bgr, frame)) for shot in frame.images),
     )
 
 
@@ -171,7 +171,7 @@ def random_lens(dice: random.Random) -> Change:
     zoom = dice.choice((0.2, 0.5, 0.8, 1.0, 1.3)) * (1 + terms[0] if model == "mei" else 1)
     distortion = Distortion(model, tuple(terms))
     return lambda frame: replace(
-        frame, shots=tuple(_through(shot, distortion, zoom) for shot in frame.shots)
+        frame, images=tuple(_through(shot, distortion, zoom) for shot in frame.images)
     )
 
 

@@ -38,7 +38,7 @@ class Cause:
 
 def _lost_pictures(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Pictures of one in so many training frames are left."""
-    return frame if frame.position // 2 % round(level) == 0 else replace(frame, shots=())
+    return frame if frame.position // 2 % round(level) == 0 else replace(frame, images=())
 
 
 CAUSES = {

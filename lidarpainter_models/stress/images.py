@@ -20,7 +20,12 @@ SPOTS = 12
 
 def exposure(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
     """Brightness jumps from picture to picture, by up to a share of it."""
-    return _each(frame, lambda shot, _: _brighter(shot, 1 + dice.uniform(-level, level)))
+
+    def jumped(shot: Shot, _: int) -> Shot:
+        factor = 1 + dice.uniform(-level, level)
+        return shot.with_pixels(lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
+
+    return _each(frame, jumped)
 
 
 def white_balance(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
@@ -76,27 +81,23 @@ def dirt(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
 
 def swapped_cameras(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """The pictures of the first pairs of cameras of one size have changed places."""
-    shots = list(frame.shots)
+    shots = list(frame.images)
     for first in range(0, min(2 * int(level), len(shots) - 1), 2):
         one, two = shots[first], shots[first + 1]
         if _size(one) == _size(two):
             shots[first] = replace(one, jpeg=two.jpeg)
             shots[first + 1] = replace(two, jpeg=one.jpeg)
-    return replace(frame, shots=tuple(shots))
+    return replace(frame, images=tuple(shots))
 
 
 def missing_cameras(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """So many cameras are not there, the last ones; one always stays."""
-    return replace(frame, shots=frame.shots[: max(len(frame.shots) - int(level), 1)])
+    return replace(frame, images=frame.images[: max(len(frame.images) - int(level), 1)])
 
 
 def _each(frame: Frame, change: Callable[[Shot, int], Shot]) -> Frame:
-    shots = tuple(change(shot, number) for number, shot in enumerate(frame.shots))
-    return replace(frame, shots=shots)
-
-
-def _brighter(shot: Shot, factor: float) -> Shot:
-    return shot.with_pixels(lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
+    shots = tuple(change(shot, number) for number, shot in enumerate(frame.images))
+    return replace(frame, images=shots)
 
 
 def _size(shot: Shot) -> tuple[int, int]:

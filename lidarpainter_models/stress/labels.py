@@ -33,12 +33,12 @@ def clock_offset(frame: Frame, level: float, _dice: np.random.Generator) -> Fram
     """Pictures are said to be taken so many milliseconds later than they were."""
     late_ns = round(level * 1e6)
     shots = []
-    for shot in frame.shots:
+    for shot in frame.images:
         then = shot.record.timestamp_ns
         motion = _driven(frame, then, late_ns)
         late = shot.seen_from(motion @ shot.record.camera.world_from_camera)
         shots.append(replace(late, record=replace(late.record, timestamp_ns=then + late_ns)))
-    return replace(frame, shots=tuple(shots))
+    return replace(frame, images=tuple(shots))
 
 
 def _driven(frame: Frame, start_ns: int, for_ns: int) -> Float[Tensor, "4 4"]:
@@ -50,18 +50,18 @@ def _driven(frame: Frame, start_ns: int, for_ns: int) -> Float[Tensor, "4 4"]:
 def camera_yaw(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Every camera is said to look so many degrees further to the right than it does."""
     turn = rigid_from_tangent(torch.tensor([0, math.radians(level), 0, 0, 0, 0]).double())
-    shots = (shot.seen_from(shot.record.camera.world_from_camera @ turn) for shot in frame.shots)
-    return replace(frame, shots=tuple(shots))
+    shots = (shot.seen_from(shot.record.camera.world_from_camera @ turn) for shot in frame.images)
+    return replace(frame, images=tuple(shots))
 
 
 def focal_length(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Every focal length is said to be longer by a share."""
     shots = []
-    for shot in frame.shots:
+    for shot in frame.images:
         lens = shot.record.camera
         longer = replace(lens, fx_px=lens.fx_px * (1 + level), fy_px=lens.fy_px * (1 + level))
         shots.append(replace(shot, record=replace(shot.record, camera=longer)))
-    return replace(frame, shots=tuple(shots))
+    return replace(frame, images=tuple(shots))
 
 
 def box_noise(frame: Frame, level: float, dice: np.random.Generator) -> Frame:

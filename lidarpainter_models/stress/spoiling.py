@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.rewriting import header_of
 from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.writer import SceneWriter
 from lidarpainter_models.stress.causes import cause_of
-from lidarpainter_models.stress.frames import Frame, read_frame
+from lidarpainter_models.stress.frames import read_frame
 
 DATASET = "stress"
 GENERATOR = "generator"
@@ -58,12 +59,7 @@ def write_spoilt(
     """
     fault = cause_of(cause)
     more = {GENERATOR: scene.manifest[GENERATOR]} if GENERATOR in scene.manifest else {}
-    header = SceneHeader(
-        licence=scene.manifest["licence"],
-        global_from_world=scene.global_from_world,
-        semantic_classes=scene.semantic_classes,
-        more={**more, STRESS: spoilt_from(scene, cause, level)},
-    )
+    header = header_of(scene, {**more, STRESS: spoilt_from(scene, cause, level)})
     train = split_views(scene, SPLIT).train_frames
     name = spoilt_name(scene, cause, level)
     with SceneWriter(store, DATASET, name, header) as writer:
@@ -72,26 +68,8 @@ def write_spoilt(
             if frame_index in train or fault.is_of_log:
                 seed = zlib.crc32(f"{cause} {frame_index}".encode())
                 frame = fault.spoil(frame, level, np.random.default_rng(seed))
-            write_frame(writer, frame)
+            frame.write(writer)
             if progress is not None:
                 progress(done, len(scene.frame_indices))
         writer.set_provenance({"spoilt": f"{scene.dataset}/{scene.sequence}"})
     return writer.path
-
-
-def write_frame(writer: SceneWriter, frame: Frame) -> None:
-    """Write a frame with all that it holds."""
-    writer.add_frame(
-        frame.frame_index, timestamp_ns=frame.timestamp_ns, world_from_ego=frame.world_from_ego
-    )
-    for shot in frame.shots:
-        writer.add_image(shot.record, shot.jpeg)
-    for turn in frame.turns:
-        writer.add_sweep(
-            turn.sweep.lidar_name,
-            turn.points,
-            timestamp_ns=turn.sweep.timestamp_ns,
-            world_from_lidar=turn.sweep.world_from_lidar,
-            semantics=turn.semantics,
-        )
-    writer.add_boxes(frame.boxes)

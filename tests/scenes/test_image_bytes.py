@@ -50,7 +50,7 @@ def test_a_tag_that_asks_for_a_turn_is_ignored(jpeg, tmp_path):
 def test_a_spoilt_image_keeps_its_way_up(jpeg):
     camera = pinhole(fx_px=48.0, fy_px=48.0, cx_px=24.0, cy_px=12.0, width_px=48, height_px=24)
     record = ImageRecord(camera_name="front", timestamp_ns=0, camera=camera)
-    spoilt = Shot(record=record, jpeg=jpeg).with_pixels(lambda bgr: bgr)
+    spoilt = Shot(record=record, jpeg=jpeg, source="").with_pixels(lambda bgr: bgr)
     assert lies_as_stored(decode_image(spoilt.jpeg))
 
 
