@@ -87,8 +87,11 @@ def write_assets(source: AssetSource, output: Path) -> list[Record]:
         *_trajectories(source, output),
     ]
     for record in records:
-        record |= _placed(source.global_from_world @ record.pop("world_from_asset"))
-        record["num_bytes"] = _size(output / record["folder"])
+        placed = source.global_from_world @ record.pop("world_from_asset")
+        record |= dict(zip(("x_m", "y_m", "z_m"), placed[:3, 3].tolist(), strict=True))
+        record["heading_rad"] = math.atan2(float(placed[1, 0]), float(placed[0, 0]))
+        files = (path for path in (output / record["folder"]).rglob("*") if path.is_file())
+        record["num_bytes"] = sum(path.stat().st_size for path in files)
     return records
 
 
@@ -251,16 +254,6 @@ def _when(track: ActorTrack | None, world: EditedWorld) -> Record:
     times_ns = world.log.ego.timestamps_ns if track is None else track.timestamps_ns
     first_s, last_s = ((int(times_ns[end]) - world.log.start_ns) * 1e-9 for end in (0, -1))
     return {"first_s": first_s, "last_s": last_s}
-
-
-def _placed(global_from_asset: Float[Tensor, "4 4"]) -> Record:
-    x_m, y_m, z_m = global_from_asset[:3, 3].tolist()
-    heading_rad = math.atan2(float(global_from_asset[1, 0]), float(global_from_asset[0, 0]))
-    return {"x_m": x_m, "y_m": y_m, "z_m": z_m, "heading_rad": heading_rad}
-
-
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def turntable(

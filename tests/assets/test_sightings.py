@@ -11,6 +11,7 @@ from lidarpainter_models.geometry.trajectory_parts import headed
 
 SIZE_M = torch.tensor([4.0, 2.0, 1.5])
 WIDTH_PX, HEIGHT_PX = 160, 120
+CLEAR_M = torch.zeros(HEIGHT_PX, WIDTH_PX)
 
 
 def camera_from(azimuth_deg, *, distance_m=12.0, up_m=0.8):
@@ -29,10 +30,9 @@ def camera_from(azimuth_deg, *, distance_m=12.0, up_m=0.8):
 
 def sighting(cameras, depth_m=None):
     """A box at the origin in views of nothing else, or of surfaces at some depth."""
-    clear = torch.zeros(HEIGHT_PX, WIDTH_PX)
     found = Sighting()
     for camera in cameras:
-        view = box_view(camera, clear if depth_m is None else depth_m, torch.eye(4), SIZE_M)
+        view = box_view(camera, CLEAR_M if depth_m is None else depth_m, torch.eye(4), SIZE_M)
         assert view is not None
         found.add_look(view, camera.fx_px)
     return found
@@ -86,9 +86,7 @@ def test_a_wall_before_a_box_hides_it():
 
 def test_pixels_and_entry_points_are_those_of_the_projected_box():
     """Straight behind, a box 2 m wide and 1.5 m high shows its rear, 10 m away, at 200 px."""
-    view = box_view(
-        camera_from(180, up_m=0.0), torch.zeros(HEIGHT_PX, WIDTH_PX), torch.eye(4), SIZE_M
-    )
+    view = box_view(camera_from(180, up_m=0.0), CLEAR_M, torch.eye(4), SIZE_M)
     assert set(view.side.tolist()) == {SIDES.index("rear")}
     assert len(view.row) == (2.0 / 10 * 200) * (1.5 / 10 * 200)
     assert view.entry_box[:, 0].tolist() == pytest.approx([-1.0] * len(view.row), abs=1e-5)
@@ -100,10 +98,8 @@ def test_pixels_and_entry_points_are_those_of_the_projected_box():
 def test_the_frame_of_the_box_decides_and_not_the_world():
     pose = headed(torch.tensor([[3.0, -2.0, 0.5]]).double(), torch.tensor([1.0]).double())[0]
     camera = camera_from(60)
-    view = box_view(
-        camera.at(pose @ camera.world_from_camera), torch.zeros(HEIGHT_PX, WIDTH_PX), pose, SIZE_M
-    )
-    alone = box_view(camera, torch.zeros(HEIGHT_PX, WIDTH_PX), torch.eye(4), SIZE_M)
+    view = box_view(camera.at(pose @ camera.world_from_camera), CLEAR_M, pose, SIZE_M)
+    alone = box_view(camera, CLEAR_M, torch.eye(4), SIZE_M)
     assert torch.equal(view.side, alone.side)
     assert torch.allclose(view.camera_box, alone.camera_box, atol=1e-5)
 
@@ -112,7 +108,7 @@ def test_who_is_behind_the_camera_is_not_seen():
     camera = camera_from(0)
     behind = torch.eye(4)
     behind[0, 3] = 30.0
-    assert box_view(camera, torch.zeros(HEIGHT_PX, WIDTH_PX), behind, SIZE_M) is None
+    assert box_view(camera, CLEAR_M, behind, SIZE_M) is None
 
 
 def test_errors_count_where_nothing_stands_before_the_box():
