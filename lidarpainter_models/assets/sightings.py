@@ -70,7 +70,14 @@ def box_view(
     world_from_box: Float[Tensor, "4 4"],
     size_m: Float[Tensor, "3"],
 ) -> BoxView | None:
-    """See a box in a view whose depth is known, 0 in the sky; None where no pixel meets it."""
+    """See a box in a view whose surfaces are known; None where no pixel meets it.
+
+    Args:
+        camera: of the view.
+        depth_m: of what is seen, 0 where that is the sky.
+        world_from_box: pose of the box.
+        size_m: length, width, height.
+    """
     outlines = box_outlines(camera, world_from_box[None], size_m[None])
     if not outlines:
         return None

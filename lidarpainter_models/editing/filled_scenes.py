@@ -44,10 +44,14 @@ def without_unseen(
     left: Sequence[ActorTrack],
     street: MapPoints,
 ) -> GaussianScene:
-    """The edited scene without Gaussians of the street that nobody has seen.
+    """The edited scene without what nobody has seen.
 
-    Surfaces of the scene as `fitted` hid what was behind them, in recorded views whose cameras are
-    where the fit found them. `street` lacks the LiDAR points of who has `left`.
+    Args:
+        scene: edited; its Gaussians of the street are looked at.
+        fitted: as it was before, whose surfaces hid what was behind.
+        views: recorded ones, their cameras where the fit found them to be.
+        left: who has gone.
+        street: LiDAR points without those of whoever has gone.
     """
     gaussians = scene.gaussians
     was_shown, was_covered = _shown(gaussians.means.detach(), fitted, views, left)

@@ -96,10 +96,14 @@ def fill_holes(
     left: Sequence[ActorTrack],
     painter: Painter | None,
 ) -> Filling:
-    """Close the holes that actors left in some recorded views, their cameras as found by the fit.
+    """Close the holes that actors left in some views.
 
-    The builder is of the edited scene, its images and points masked where it was edited; `fitted`
-    is the scene before. A painter has the last word on colours; None leaves that to what is around.
+    Args:
+        builder: of the edited scene, whose images and points are masked where it was edited.
+        fitted: the scene as it was before.
+        views: the recorded ones, their cameras as found by the fit.
+        left: who is not there any more.
+        painter: has the last word on colours; None leaves that to what is around.
     """
     scene, confidence = builder.scene, [torch.zeros(0)]
     num_before = len(scene.gaussians)

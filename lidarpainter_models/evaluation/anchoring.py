@@ -68,7 +68,8 @@ def predicted_and_measured(frames: Iterable[JudgedFrame]) -> list[tuple[float, f
 def what_frames_say(held_out_db: Sequence[tuple[float, float]]) -> dict[str, Any]:
     """What an envelope says of the log behind it, as JSON types.
 
-    Told by the PSNR of held-out frames of the log, by `BUNDLED` and as measured.
+    Args:
+        held_out_db: PSNR of held-out frames of the log, by `BUNDLED` and as measured.
     """
     residuals = [measured - predicted for predicted, measured in held_out_db]
     is_checked = len(residuals) >= LEAST_FRAMES

@@ -24,7 +24,10 @@ def fid_scores(
 ) -> dict[str, dict[str, Any]]:
     """`fid` and `kid` of each set of shown images, or None with the reason.
 
-    Images are rgb in 0..1, those shown by trajectory; without a network nothing is looked at.
+    Args:
+        network: Inception; without it nothing is looked at.
+        real: recorded images, rgb 0..1.
+        shown: images of each trajectory, rgb 0..1.
 
     Returns:
         By trajectory: `fid`, `kid`, `num_real` and `num_shown` images, or `fid_reason` and

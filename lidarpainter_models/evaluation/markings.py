@@ -91,9 +91,13 @@ def markings_scores(
     shifts: tuple[Shift, ...],
     progress: Callable[[int, int], None],
 ) -> Scores:
-    """Judge the markings that cameras looking ahead show at held-out times, there and shifted.
+    """Judge the markings that cameras looking ahead show at held-out times.
 
-    Sweeps of the held-out frames tell where the paint is; `progress` is told of every render.
+    Args:
+        held_out: Views that no fit saw; their frames' sweeps tell where the paint is.
+        shown: The fitted scene, as it is or painted at view time.
+        shifts: How far beside the path it is looked at, beside the path itself.
+        progress: Is told how many renders of how many are done.
 
     Returns:
         Under `markings`, by trajectory (`image`, `recorded`, then the shifts): `auc` over all

@@ -188,6 +188,9 @@ FORMAT_NAMES = tuple(row.name for row in FORMATS)
 def export_format(name: str) -> ExportFormat:
     """The row of a format.
 
+    Args:
+        name: what stands after `--format`.
+
     Raises:
         ConfigError: there is no such format.
     """

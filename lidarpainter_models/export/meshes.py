@@ -30,9 +30,11 @@ Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 
 
 def obstacle_mesh(points_m: Float[np.ndarray, "points 3"], eye_m: Float[np.ndarray, "3"]) -> Mesh:
-    """Triangles through points of the world that stand on the ground.
+    """Triangles through points that stand on the ground.
 
-    Faces turn to `eye_m`, from where the points were seen, about.
+    Args:
+        points_m: the points, in the world.
+        eye_m: where they were seen from, about: faces turn to it.
     """
     import open3d
 

@@ -24,7 +24,14 @@ _MARK_WIDTH_M = 0.15
 
 
 def opendrive(road: Road, ground: GroundSurface, name: str, said: Mapping[str, str]) -> bytes:
-    """The road as the bytes of an .xodr file; what else is `said` of it is `userData` by code."""
+    """The road as the bytes of an .xodr file.
+
+    Args:
+        road: the driven road with its lanes.
+        ground: its heights.
+        name: of the road.
+        said: what else is to be known, as `userData` of the file by code.
+    """
     root = ET.Element("OpenDRIVE")
     low, high = road.line.xy_m.min(axis=0) - 20, road.line.xy_m.max(axis=0) + 20
     extent = {"west": low[0], "east": high[0], "south": low[1], "north": high[1]}

@@ -52,7 +52,12 @@ def simulated_sweeps(
 ) -> Iterator[WrittenSweep]:
     """What a LiDAR would measure, at the times of the log's own sweeps.
 
-    The log has its poses as the fit found them; the scene is the fit, or a change of it.
+    Args:
+        request: which sweeps, by which sensor, from where.
+        log: with its poses as the fit found them.
+        scene: the fit, or a change of it.
+        channel: what was learnt of the log's LiDAR.
+        lidar: the log's own sensor.
 
     Raises:
         SceneError: no sweep is left.

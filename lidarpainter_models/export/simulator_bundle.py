@@ -80,9 +80,14 @@ class BundleContents:
 
 
 def write_bundle(path: Path, contents: BundleContents) -> dict[str, int]:
-    """Write a bundle, and tell the size of every member in bytes.
+    """Write a bundle.
 
-    The caller sees to it that the file appears whole.
+    Args:
+        path: where the file appears; the caller sees to it that it does so whole.
+        contents: what is written.
+
+    Returns:
+        The size of every member in bytes.
 
     Raises:
         DataError: a member is larger than a .usdz can hold.
@@ -236,7 +241,10 @@ def rig_from_camera(
 ) -> Float[Tensor, "4 4"]:
     """Where a camera sits on the car (float64): as in the image in the middle of the log.
 
-    The log is as it was recorded; the scene refines the poses of cameras and of the car.
+    Args:
+        scene: which refines the poses of cameras and of the car.
+        log: as it was recorded.
+        camera_name: a camera of the log.
     """
     views = log.views_of(camera_name)
     view = views[len(views) // 2]

@@ -58,7 +58,11 @@ def write_styled(
 ) -> tuple[list[dict[str, Any]], dict[str, float | None]]:
     """Write a styled image for every moment of a path, and the clear one to `clear/`.
 
-    `advanced` is told how many views are done.
+    Args:
+        path: where to look from.
+        request: which images, and their style.
+        out: folder for the images.
+        advanced: told how many views are done.
 
     Returns:
         A row for each image as JSON, and how well edges are kept, means over images.

@@ -25,7 +25,8 @@ TELLING = 0.005
 def verdict(result: Mapping[str, Any]) -> list[str]:
     """Sentences about recorded views, views aside, and actors.
 
-    `result` is what `reconstruct --json` prints of a run; entries of older runs may lack.
+    Args:
+        result: what `reconstruct --json` prints of a run; entries of older runs may lack.
     """
     if (recorded := result.get("recorded")) is None:
         judged = ["Nobody judged this scene: `lidarpainter evaluate` does."]

@@ -72,8 +72,13 @@ def write_views(
 ) -> tuple[list[list[dict[str, Any]]], float]:
     """Write everything that is wanted of the paths of a rig, moment by moment.
 
-    Each path, of one camera, has its folder, and its film if there are `films`; the film
-    `together` shows all cameras at once. `advanced` is called after every view.
+    Args:
+        paths: where to look from, a path for each camera.
+        folders: where the files of each are put.
+        delivery: what is wanted.
+        films: one for each path; none if empty.
+        together: a film that shows all cameras at once.
+        advanced: called after every view.
 
     Returns:
         By path, where each view was taken, how far it can be trusted, and its files, as JSON; and

@@ -98,8 +98,13 @@ def followed_paths(
 ) -> list[FollowedPath]:
     """What the images of a request are made from, a path for every camera.
 
-    The scene of `builder` was fitted to `recorded`, to images of `fitted_cameras` made as
-    `observation` says; `load_painter` is called where images are painted.
+    Args:
+        request: where to look from, and whether images are painted.
+        recorded: the recording that the scene was fitted to.
+        builder: the fitted scene, and what is known of its views.
+        fitted_cameras: names of the cameras that the fit saw.
+        observation: how the images of the fit were made.
+        load_painter: gives the painter; called where images are painted.
 
     Raises:
         SceneError: the scene has no such camera, or no frame is left.

@@ -144,7 +144,14 @@ class ClosedLoop:
     def drive(
         self, policy: Policy, sensors: Sensors, *, start_ns: int, seconds: float
     ) -> Iterator[Moment]:
-        """Let a policy drive, moment by moment, from where the recording car was at a time."""
+        """Let a policy drive, moment by moment, from where the recording car was at a time.
+
+        Args:
+            policy: who drives.
+            sensors: what its cameras see.
+            start_ns: when the drive begins.
+            seconds: how long it lasts.
+        """
         begin = self.path.driven_on(torch.tensor([start_ns])).world_from_body[0]
         state = self._begun(begin, start_ns)
         rig_from_ground = invert_rigid(self._ground_pose(state)) @ begin

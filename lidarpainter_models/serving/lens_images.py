@@ -115,8 +115,10 @@ class LensImage:
     def of(cls, camera: SensorCamera, fitted_px: float = 0.0) -> "LensImage":
         """Find the rays of a lens and the faces that they meet.
 
-        Faces are drawn about as fine as the images that Gaussians were fitted to, of focal length
-        `fitted_px`, or as they are sampled if that is finer.
+        Args:
+            camera: The lens.
+            fitted_px: Focal length of the images that Gaussians were fitted to; faces are drawn
+                about as fine, or as they are sampled if that is finer.
         """
         rays, is_seen = camera.pixel_rays()
         seen = rays[is_seen]

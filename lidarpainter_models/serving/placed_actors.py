@@ -91,7 +91,11 @@ def placed_actors(
 ) -> Actors:
     """The actors of a scene as a request has them; as recorded, where it has them so.
 
-    `parked` actors are part of its street; the middle of the image is read at `taken_ns`.
+    Args:
+        actors: of the fitted scene.
+        parked: recorded actors that are part of its street, by id.
+        request: who is there, and where.
+        taken_ns: when the middle of the image is read.
 
     Raises:
         RequestError: INVALID_ARGUMENT: the scene has no such actor, or one that cannot be moved.

@@ -144,8 +144,11 @@ def follow_lead(seen: Observation) -> tuple[float, float]:
 def idm_mps2(speed_mps: float, desired_mps: float, gap_m: float, lead_mps: float) -> float:
     """Acceleration of the intelligent driver model, Treiber et al. (2000).
 
-    The speed is desired on a free road; the gap is that to the one in front, bumper to bumper,
-    infinite where there is none.
+    Args:
+        speed_mps: own speed.
+        desired_mps: on a free road.
+        gap_m: to the one in front, bumper to bumper; infinite where there is none.
+        lead_mps: its speed.
     """
     free = (speed_mps / max(desired_mps, 0.1)) ** EXPONENT
     closing_mps = speed_mps - lead_mps

@@ -131,7 +131,11 @@ class ServedScene:
         return other
 
     def frame(self, request: SensorRequest, client: str = "") -> Frame:
-        """The image that a request asks for; a client's frames of a camera are painted to agree.
+        """The image that a request asks for.
+
+        Args:
+            request: what is asked for.
+            client: who asks; frames of one client and camera are painted in agreement.
 
         Raises:
             RequestError: OUT_OF_RANGE: the scene knows nothing of that time; INVALID_ARGUMENT: it

@@ -102,9 +102,12 @@ class SensorClient:
 
 @contextmanager
 def connected(address: str, wanted: tuple[str, ...], *, width_px: int) -> Iterator[SensorClient]:
-    """The cameras of a scene at a renderer, which is at `HOST:PORT`.
+    """The cameras of a scene at a renderer.
 
-    `wanted` are names that the scene may have there; the first that is there is taken.
+    Args:
+        address: HOST:PORT.
+        wanted: names that the scene may have there; the first that is there is taken.
+        width_px: how wide images shall be.
 
     Raises:
         DataError: nobody answers there, or without such a scene or without cameras.
