@@ -8,6 +8,8 @@ from torch import Tensor
 
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
+COLUMNS = ("frame_indices", "timestamps_ns", "num_points", "world_from_box", "size_m")
+
 
 def tracks_to_arrays(
     tracks: Sequence[ActorTrack],
