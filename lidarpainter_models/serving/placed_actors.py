@@ -4,7 +4,9 @@ A pair of poses says where an actor is when the shutter opens and when it closes
 around it, it moves on evenly. Bodies bend and lamps are lit as they were recorded at that time.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -14,7 +16,7 @@ from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation, rigid_from_tangent
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 from lidarpainter_models.serving.messages import SensorRequest, TimedRequest, middle_of
 from lidarpainter_models.serving.refusals import invalid
 
@@ -42,6 +44,19 @@ class PlacedActors(Actors):
     def refined_poses(self, timestamp_ns: int) -> ActorPoses:
         """The same: where actors are put needs no correction."""
         return self.recorded_poses(timestamp_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class ParkedActors:
+    """Recorded actors that are part of the street."""
+
+    tracks: Mapping[str, ActorTrack]
+    """By actor id."""
+
+    @cached_property
+    def poses(self) -> TrackPoses:
+        """Where they stand, in the order of the tracks."""
+        return TrackPoses.of([*self.tracks.values()])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,13 +102,13 @@ def reads_alike(request: SensorRequest, camera: Camera) -> bool:
 
 
 def placed_actors(
-    actors: Actors, parked: dict[str, ActorTrack], request: TimedRequest, taken_ns: int
+    actors: Actors, parked: ParkedActors, request: TimedRequest, taken_ns: int
 ) -> Actors:
     """The actors of a scene as a request has them; as recorded, where it has them so.
 
     Args:
         actors: of the fitted scene.
-        parked: recorded actors that are part of its street, by id.
+        parked: recorded actors that are part of its street.
         request: who is there, and where.
         taken_ns: when the middle of the image is read.
 
@@ -141,24 +156,27 @@ def twists_of(pairs: Float[Tensor, "bodies 2 4 4"], span_s: float) -> Float[Tens
 
 def _check_strangers(
     rows_of: dict[str, int],
-    parked: dict[str, ActorTrack],
+    parked: ParkedActors,
     request: TimedRequest,
     middle: Float[Tensor, "actors 4 4"],
     taken_ns: int,
 ) -> None:
     """Refuse who is not in the scene, and who is part of its street and is moved."""
-    strange = [name for name in request.actor_ids if name not in rows_of and name not in parked]
+    known, names = parked.tracks, request.actor_ids
+    strange = [name for name in names if name not in rows_of and name not in known]
     if strange:
         more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
         raise invalid(
             f"dynamic object {strange[0]!r}{more}: the scene has no such actor; "
             "get_dynamic_objects lists those it has"
         )
-    for place, name in enumerate(request.actor_ids):
-        if name in parked:
-            away = middle[place, :3, 3] - parked[name].pose_at(taken_ns)[:3, 3]
-            if float(away.norm()) > PARKED_M:
-                raise invalid(
-                    f"dynamic object {name!r} is parked and part of the street: it cannot be "
-                    f"moved by {float(away.norm()):.1f} m, expected at most {PARKED_M:g} m"
-                )
+    row_of = {name: row for row, name in enumerate(known)}
+    places = [place for place, name in enumerate(names) if name in known]
+    own = [row_of[names[place]] for place in places]
+    away_m = (middle[places] - parked.poses.all_at(taken_ns)[own])[:, :3, 3].norm(dim=1)
+    for place, moved_m in zip(places, away_m.tolist(), strict=True):
+        if moved_m > PARKED_M:
+            raise invalid(
+                f"dynamic object {names[place]!r} is parked and part of the street: it cannot be "
+                f"moved by {moved_m:.1f} m, expected at most {PARKED_M:g} m"
+            )

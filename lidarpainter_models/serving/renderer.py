@@ -33,13 +33,13 @@ from lidarpainter_models.observations.image_shrinking import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
-from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.serving.lens_images import Face, LensImage, ReadByLens, reading_times
 from lidarpainter_models.serving.lens_models import SensorCamera
 from lidarpainter_models.serving.messages import SensorRequest, TimedRequest
 from lidarpainter_models.serving.painted_streams import PaintedStreams
 from lidarpainter_models.serving.placed_actors import (
     Moment,
+    ParkedActors,
     placed_actors,
     reads_alike,
     same_lens,
@@ -106,11 +106,11 @@ class ServedScene:
         return max(first_ns // 1000, 0), last_ns // 1000
 
     @cached_property
-    def parked(self) -> dict[str, ActorTrack]:
-        """Recorded actors that are part of the street, by id."""
+    def parked(self) -> ParkedActors:
+        """Recorded actors that are part of the street."""
         moving = {track.actor_id for track in self.scene.actors.recorded_tracks}
-        tracks = self.recorded.tracks
-        return {track.actor_id: track for track in tracks if track.actor_id not in moving}
+        tracks = {track.actor_id: track for track in self.recorded.tracks}
+        return ParkedActors({name: tracks[name] for name in tracks if name not in moving})
 
     @cached_property
     def evidence(self) -> EvidenceGatherer | None:

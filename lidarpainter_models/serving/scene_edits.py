@@ -184,7 +184,7 @@ def world_of(served: ServedScene) -> EditedWorld:
         fitted=served.scene,
         lidar_map=builder.lidar_map,
         views=builder.training_views,
-        parked=tuple(served.parked.values()),
+        parked=tuple(served.parked.tracks.values()),
         log=LogTimes(ego=driven_road(recorded)),
     )
 

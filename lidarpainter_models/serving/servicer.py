@@ -175,7 +175,7 @@ class SensorsimServicer:
     def get_dynamic_objects(self, message: Message, _context: "ServicerContext") -> Message:
         """Every actor with its poses: those that can be moved, and those that are parked."""
         served, reply = self.scenes.get(message.scene_id), sensorsim_pb2.DynamicObjectsReturn()
-        for track in (*served.scene.tracks, *served.parked.values()):
+        for track in (*served.scene.tracks, *served.parked.tracks.values()):
             length_m, width_m, height_m = track.size_m.tolist()
             reply.dynamic_objects.add(
                 id=track.actor_id,

@@ -117,7 +117,7 @@ def test_a_parked_car_can_be_left_out_once_it_is_no_part_of_the_street(street):
     ids = {track.actor_id for track in apart.scene.actors.recorded_tracks}
     freed = ids - {track.actor_id for track in street.scene.actors.recorded_tracks}
     assert freed
-    assert not freed & set(apart.parked)
+    assert not freed & set(apart.parked.tracks)
     bodies = apart.scene.gaussians.body_index
     assert len(bodies) >= len(street.scene.gaussians)
     assert int((bodies > 0).sum()) > int((street.scene.gaussians.body_index > 0).sum())
