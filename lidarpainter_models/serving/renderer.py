@@ -147,7 +147,7 @@ class ServedScene:
             painter = self.streams.painter(moment, self.builder, client)
         rgb, trust = both(
             partial(self._image, request, moment, painter),
-            partial(self._trust, request, moment),
+            partial(self.trust, request, moment),
             self.scene.device,
         )
         if request.own_body_of is not None:
@@ -155,8 +155,9 @@ class ServedScene:
         rgb_u8 = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         return Frame(rgb_u8=rgb_u8, trust=trust)
 
-    def _trust(self, request: SensorRequest, moment: Moment) -> Trust:
+    def trust(self, request: SensorRequest, moment: Moment | None = None) -> Trust:
         """How far the image of a request can be trusted, before anybody paints it."""
+        moment = self._moment(request) if moment is None else moment
         distance_m = None
         if self.envelope is not None:
             distance_m = self._distance(request.camera_name).of(moment.world_from_camera)
