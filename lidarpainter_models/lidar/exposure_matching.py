@@ -83,6 +83,7 @@ def _camera_gains(
                 values.append(np.median(ratios, axis=0))
                 weights.append(np.sqrt(len(ratios)))
     gains = np.zeros((num_cameras, 3))
+    # only cameras that pairs link to the first one have a gain beside its
     are_compared = np.array(rows).reshape(-1, num_cameras) != 0
     _, group = connected_components(are_compared.T.astype(int) @ are_compared)
     free = np.flatnonzero(group[1:] == group[0]) + 1

@@ -155,12 +155,12 @@ def recorded_rays(scene: DrivingScene, sweep: Sweep, lidar: MountedLidar) -> Swe
     )
     if not lidar.tells_lost:
         return returned
-    beam, head_deg, time_ns = _missing(seen, beam, sensor)
+    lost_beam, head_deg, time_ns = _missing(seen, beam, sensor)
     absent = unanswered_rays(
         lidar.world_from_sensor(torch.from_numpy(time_ns)),
-        torch.from_numpy(sensor.directions(beam, head_deg)),
+        torch.from_numpy(sensor.directions(lost_beam, head_deg)),
         torch.from_numpy(time_ns),
-        torch.from_numpy(beam),
+        torch.from_numpy(lost_beam),
     )
     return SweepRays.joined([returned, absent])
 

@@ -115,9 +115,11 @@ def _show_more(poses: Iterable[tuple[str, int, Float[Tensor, "4 4"]]]) -> list[b
     are_new = []
     for sensor, time_ns, pose in poses:
         place = pose[:3, 3]
-        before_ns, before = last.get(sensor, (time_ns - MOST_PAUSE_NS, place))
-        moved_m = float((place - before).norm())
-        is_new = moved_m >= LEAST_WAY_M or time_ns - before_ns >= MOST_PAUSE_NS
+        is_new = sensor not in last
+        if not is_new:
+            before_ns, before = last[sensor]
+            moved_m = float((place - before).norm())
+            is_new = moved_m >= LEAST_WAY_M or time_ns - before_ns >= MOST_PAUSE_NS
         if is_new:
             last[sensor] = (time_ns, place)
         are_new.append(is_new)

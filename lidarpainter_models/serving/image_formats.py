@@ -36,6 +36,8 @@ class Encoding:
 def encoding_of(image_format: int, quality: float) -> Encoding:
     """The encoding that a request names; no format is PNG, no quality 95.
 
+    Qualities up to 1 are parts of the best one: some clients count so, and nobody wants 1 of 100.
+
     Raises:
         RequestError: INVALID_ARGUMENT, for films and for what is unknown.
     """
@@ -50,8 +52,9 @@ def encoding_of(image_format: int, quality: float) -> Encoding:
     if ending and not cv2.haveImageWriter(f"image{ending}"):
         raise invalid(f"image_format {ending}: the OpenCV of this server cannot write it")
     if not 0 <= quality <= 100:  # NaN too
-        raise invalid(f"image_quality {quality:g}: expected 1 to 100")
-    return Encoding(ending, round(quality) or QUALITY)
+        raise invalid(f"image_quality {quality:g}: expected 0 to 1, or 1 to 100")
+    of_100 = 100 * quality if quality <= 1 else quality
+    return Encoding(ending, round(of_100) or QUALITY)
 
 
 def encoded(rgb_u8: UInt8[np.ndarray, "height width 3"], encoding: Encoding) -> bytes:

@@ -144,7 +144,10 @@ class SyntheticStreetConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Turn the settings into values that JSON can hold."""
-        return asdict(self)
+        values = asdict(self)
+        values["cameras"] = list(values["cameras"])
+        values["speed_mps"] = None if self.speed_mps is None else list(self.speed_mps)
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SyntheticStreetConfig":

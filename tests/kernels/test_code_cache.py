@@ -61,6 +61,7 @@ def test_kernels_keep_their_code_so():
 
 
 def test_code_is_found_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # numba reads it again as it compiles
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     body = "import numba\n@numba.njit(cache=True)\ndef twice(values):\n    return values * 2\n"
     (tmp_path / "doubling.py").write_text(body)

@@ -60,8 +60,9 @@ class OneStepNetwork(nn.Module):
         latents, skips = self._encode(images, encodes_at_once=encodes_at_once)
         weights = self._weights(latents)
         fused = mix(weights, latents.float())
-        side_by_side = latents.transpose(0, 1).flatten(1, 2)
-        seen = fused if self.config.denoiser_sees == "fused" else side_by_side
+        seen = fused
+        if self.config.denoiser_sees != "fused":
+            seen = latents.transpose(0, 1).flatten(1, 2)  # side by side
         if masks is not None:
             seen = torch.cat([seen, masks.to(seen.dtype)], dim=1)
         predicted = self.denoiser(seen, text)

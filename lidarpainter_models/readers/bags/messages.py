@@ -307,4 +307,7 @@ def _protobuf_decoder(schema: "Schema") -> Callable[[bytes], Any]:
     from google.protobuf import descriptor_pb2, message_factory
 
     files = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
-    return message_factory.GetMessages(files)[schema.name].FromString
+    kinds = message_factory.GetMessages(files)
+    if schema.name not in kinds:
+        raise ValueError(f"its schema describes no {schema.name}")
+    return kinds[schema.name].FromString
