@@ -220,8 +220,22 @@ class Style(OperationWords):
         return self
 
 
-_Change = Remove | Move | Insert | Swap | Scale | Retime | Stop | Lamps | Freeze | Crop | Join
-Operation = Annotated[_Change | Drive | Style, Field(discriminator="op")]
+Operation = Annotated[
+    Remove
+    | Move
+    | Insert
+    | Swap
+    | Scale
+    | Retime
+    | Stop
+    | Lamps
+    | Freeze
+    | Crop
+    | Join
+    | Drive
+    | Style,
+    Field(discriminator="op"),
+]
 _SCRIPT: TypeAdapter[tuple[Operation, ...]] = TypeAdapter(
     Annotated[tuple[Operation, ...], Field(strict=False, max_length=MOST_OPERATIONS)]
 )

@@ -108,10 +108,12 @@ def values_by_view(
         for place, values in found.items()
         if "psnr_by_view" in values
     }
-    rows = (scores.get(ENVELOPE) or {}).get("stretches", ())
-    for name in TRUSTED if rows else ():
-        by_stretch = {f"{row['from_m']:.0f}-{row['to_m']:.0f}m": row[name] for row in rows}
-        by_view[ENVELOPE, *_trusted_name(name)] = by_stretch
+    if envelope := scores.get(ENVELOPE):
+        for name in TRUSTED:
+            by_view[ENVELOPE, *_trusted_name(name)] = {
+                f"{row['from_m']:.0f}-{row['to_m']:.0f}m": row[name]
+                for row in envelope["stretches"]
+            }
     return by_view
 
 

@@ -150,8 +150,9 @@ def _metadata(bundle: OpenedBundle) -> Lines:
         UUID(str(said["uuid"]))
     except ValueError:
         yield "fail", f"uuid {str(said['uuid'])[:60]!r} is none: no suite can pin this scene"
-    span = [part(said, "time_range", key) for key in ("start", "end")]
-    start, end = numbers(span, "time_range", 2)
+    start, end = numbers(
+        [part(said, "time_range", key) for key in ("start", "end")], "time_range", 2
+    )
     if start >= end:
         yield "fail", "time_range ends before it starts"
     cameras = part(said, "sensors", "camera_ids")
@@ -174,8 +175,9 @@ def _trusted(outputs: dict[str, Any]) -> tuple[Verdict, str]:
 
 def _rig(bundle: OpenedBundle) -> Lines:
     said = bundle.json("rig_trajectories.json")
-    nre = numbers(part(said, "world_to_nre", "matrix"), "world_to_nre.matrix", 4, 4)
-    _rigid(nre[None], "matrix")
+    _rigid(
+        numbers(part(said, "world_to_nre", "matrix"), "world_to_nre.matrix", 4, 4)[None], "matrix"
+    )
     for trajectory in part(said, "rig_trajectories"):
         times = numbers(part(trajectory, "T_rig_world_timestamps_us"), "rig times", -1)
         poses = numbers(part(trajectory, "T_rig_worlds"), "T_rig_worlds", -1, 4, 4)
@@ -197,8 +199,10 @@ def _exposures(
     said: dict[str, Any], trajectory: dict[str, Any], times: Float[np.ndarray, " times"]
 ) -> Lines:
     """Lines about the cameras of a trajectory and when they exposed."""
-    calibrations = part(said, "camera_calibrations")
-    exposures = part(trajectory, "cameras_frame_timestamps_us")
+    calibrations, exposures = (
+        part(said, "camera_calibrations"),
+        part(trajectory, "cameras_frame_timestamps_us"),
+    )
     for camera, spans in exposures.items():
         if camera not in calibrations or "logical_sensor_name" not in calibrations[camera]:
             raise DataError(f"camera {camera[:80]!r} has no calibration with a logical_sensor_name")
@@ -209,8 +213,10 @@ def _exposures(
             yield "warn", f"camera {camera[:80]!r} exposes while no pose of the rig is known"
     bare = [name for name, one in calibrations.items() if "T_sensor_rig" not in one]
     if bare:
-        words = "have no T_sensor_rig: their place is the renderer's word"
-        yield "warn", f"{len(bare)} cameras {words}"
+        yield (
+            "warn",
+            f"{len(bare)} cameras have no T_sensor_rig: their place is the renderer's word",
+        )
     yield "ok", f"{len(exposures)} cameras, each exposure after the one before ends in order"
 
 
@@ -234,8 +240,9 @@ def _tracks(bundle: OpenedBundle) -> Lines:
         raise DataError("tracks_data and cuboids_dims hold different numbers of tracks")
     if len(set(map(str, columns["id"]))) < len(dims) or (dims <= 0).any():
         raise DataError("two tracks have one id, or a box has no size")
-    named = (columns[key] for key in ("id", "timestamps_us", "poses"))
-    for name, times, poses in zip(*named, strict=True):
+    for name, times, poses in zip(
+        columns["id"], columns["timestamps_us"], columns["poses"], strict=True
+    ):
         moments = numbers(times, f"times of track {str(name)[:40]}", -1)
         placed = numbers(poses, f"poses of track {str(name)[:40]}", -1, 7)
         turned = np.abs(np.linalg.norm(placed[:, 3:], axis=1) - 1) > 1e-3
@@ -258,9 +265,9 @@ def _meshes(bundle: OpenedBundle) -> Lines:
         raise DataError(f"{name}: lies nowhere below the path")
     share = float(np.isfinite(height).mean())
     middle = float(np.nanmedian(height))
-    is_sound = share == 1 and abs(middle) < 4 and widest <= MOST_GAP_M
+    verdict: Verdict = "ok" if share == 1 and abs(middle) < 4 and widest <= MOST_GAP_M else "warn"
     yield (
-        "ok" if is_sound else "warn",
+        verdict,
         (
             f"{name}: {len(faces)} faces, below {share:.0%} of the path, {middle:.2f} m "
             f"under the rig, widest hole within {NEAR_PATH_M:g} m of it {widest:.1f} m"
@@ -278,7 +285,10 @@ def _below(
 
     tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    scene.add_triangles(
+        tensor(vertices.astype(np.float32)),
+        tensor(faces.astype(np.uint32)),
+    )
     aside = np.arange(-NEAR_PATH_M, NEAR_PATH_M + 0.01, 0.1)
     grid = np.stack([*np.meshgrid(aside, aside), np.zeros((len(aside), len(aside)))], axis=-1)
     looked_at = path_m[:: 1 + len(path_m) // MOST_PLACES, None]

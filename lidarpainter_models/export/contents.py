@@ -26,6 +26,7 @@ from lidarpainter_models.gaussians.model.placing import carried_gaussians, joine
 from lidarpainter_models.gaussians.model.ply_files import write_ply
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.sky_texture import SkyLayout
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 
 
@@ -119,10 +120,19 @@ class SceneContents:
 
     def placed(self, time: int) -> GaussianSet:
         """Everything that is there at the n-th of the times, in the world."""
-        poses = self.world_from_actor[time]
-        there = self.is_present[time].nonzero()[:, 0].tolist()
-        actors = [carried_gaussians(self.actors[row].gaussians, poses[row]) for row in there]
-        return joined_gaussians([self.street, *actors])
+        there = self.is_present[time].tolist()
+        return joined_gaussians(
+            [
+                self.street,
+                *(
+                    carried_gaussians(actor.gaussians, pose)
+                    for actor, pose, is_there in zip(
+                        self.actors, self.world_from_actor[time], there, strict=True
+                    )
+                    if is_there
+                ),
+            ]
+        )
 
 
 def write_ply_scene(path: Path, contents: SceneContents, *, time: int = 0) -> None:
@@ -159,9 +169,7 @@ def scene_contents(
         known = ", ".join(sorted(places)[:20]) or "none that moves"
         raise SceneError(f"scene {name} has no actor {missing[0]!r}, it has {known}")
     gaussians = scene.gaussians_at(timestamps_ns[0] if len(timestamps_ns) == 1 else None)
-    order = torch.argsort(gaussians.body_index, stable=True)
-    sizes = torch.bincount(gaussians.body_index.long(), minlength=len(tracks) + 1).tolist()
-    bodies = [gaussians.select(part).of_body(0) for part in order.split(sizes)]
+    bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]
     poses = [scene.actors.refined_poses(time_ns) for time_ns in timestamps_ns]
@@ -183,6 +191,13 @@ def scene_contents(
     )
 
 
+def _bodies(gaussians: GaussianSet, count: int) -> list[GaussianSet]:
+    """The Gaussians of every body, each as body 0 of its own."""
+    order = torch.argsort(gaussians.body_index, stable=True)
+    sizes = torch.bincount(gaussians.body_index.long(), minlength=count).tolist()
+    return [gaussians.select(rows).of_body(0) for rows in order.split(sizes)]
+
+
 def sky_gaussians(sky: SkyTexture, scene: GaussianScene) -> GaussianSet:
     """Gaussians on a far sphere that show the sky's texture, around the middle of the drive."""
     layout = sky.layout
@@ -190,14 +205,7 @@ def sky_gaussians(sky: SkyTexture, scene: GaussianScene) -> GaussianSet:
     colours = torch.nn.functional.avg_pool2d(
         sky.rgb.detach().permute(2, 0, 1)[None], step, ceil_mode=True, count_include_pad=False
     )[0].permute(1, 2, 0)
-    row, column = (
-        (torch.arange(count, dtype=torch.float64) + 0.5) * step for count in colours.shape[:2]
-    )
-    elevation = (layout.elevation_top_rad - row * layout.texel_rad)[:, None]
-    azimuth = (layout.azimuth_left_rad - column * layout.texel_rad)[None, :]
-    flat = elevation.cos()
-    along = [flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin() + 0 * azimuth]
-    directions = torch.stack(along, dim=-1).flatten(0, 1)
+    directions = _texel_directions(layout, step, colours.shape[0], colours.shape[1])
     rgb = colours.flatten(0, 1)
     count = len(rgb)
     centre = scene.cameras.recorded_world_from_camera[:, :3, 3].mean(dim=0)
@@ -211,3 +219,16 @@ def sky_gaussians(sky: SkyTexture, scene: GaussianScene) -> GaussianSet:
         sh_rest=torch.zeros(count, scene.gaussians.sh_rest.shape[1], 3),
         body_index=torch.zeros(count, dtype=torch.int32),
     )
+
+
+def _texel_directions(
+    layout: SkyLayout, step: int, rows: int, columns: int
+) -> Float[Tensor, "texels 3"]:
+    """World directions of blocks of texels, row by row."""
+    row = (torch.arange(rows, dtype=torch.float64) + 0.5) * step
+    column = (torch.arange(columns, dtype=torch.float64) + 0.5) * step
+    elevation = (layout.elevation_top_rad - row * layout.texel_rad)[:, None]
+    azimuth = (layout.azimuth_left_rad - column * layout.texel_rad)[None, :]
+    flat = elevation.cos()
+    directions = [flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin() + 0 * azimuth]
+    return torch.stack(directions, dim=-1).flatten(0, 1)

@@ -34,9 +34,19 @@ def opendrive(road: Road, ground: GroundSurface, name: str, said: Mapping[str, s
     """
     root = ET.Element("OpenDRIVE")
     low, high = road.line.xy_m.min(axis=0) - 20, road.line.xy_m.max(axis=0) + 20
-    extent = {"west": low[0], "east": high[0], "south": low[1], "north": high[1]}
-    told: dict[str, float | str] = {"version": "1.00", **extent, "vendor": "LidarPainter"}
-    header = _add(root, "header", revMajor=1, revMinor=7, name=name, **told)
+    header = _add(
+        root,
+        "header",
+        revMajor=1,
+        revMinor=7,
+        name=name,
+        version="1.00",
+        west=low[0],
+        east=high[0],
+        south=low[1],
+        north=high[1],
+        vendor="LidarPainter",
+    )
     for code, value in said.items():
         _add(header, "userData", code=code, value=value)
     pieces = max(1, round((road.line.s_m[-1] - road.line.s_m[0]) / PIECE_M))
@@ -114,12 +124,21 @@ def _add_lanes(
 
 
 def _add_mark(lane: ET.Element, mark: str) -> None:
-    usual = {"weight": "standard", "color": "standard"}
-    _add(lane, "roadMark", sOffset=0, type=mark, **usual, width=_MARK_WIDTH_M)
+    _add(
+        lane,
+        "roadMark",
+        sOffset=0,
+        type=mark,
+        weight="standard",
+        color="standard",
+        width=_MARK_WIDTH_M,
+    )
 
 
 def _add_heights(
-    parent: ET.Element, starts_m: Float[np.ndarray, " ends"], heights_m: Float[np.ndarray, " ends"]
+    parent: ET.Element,
+    starts_m: Float[np.ndarray, " ends"],
+    heights_m: Float[np.ndarray, " ends"],
 ) -> None:
     """A profile through heights at the ends of the pieces, with continuous slope."""
     slope = np.gradient(heights_m, starts_m)

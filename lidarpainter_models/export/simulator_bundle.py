@@ -32,7 +32,6 @@ from lidarpainter_models.export.meshes import joined, obstacle_mesh, ply_bytes
 from lidarpainter_models.export.opendrive import opendrive
 from lidarpainter_models.export.usd_files import MAX_PACKED_BYTES, write_usd
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.lidar.surroundings import Surroundings
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
@@ -225,7 +224,7 @@ def _calibration(contents: BundleContents, name: str, number: int) -> dict[str, 
             "type": "opencv-pinhole",
             "parameters": {
                 "resolution": [camera.width_px, camera.height_px],
-                "shutter_type": shutter_name(camera),
+                "shutter_type": camera.shutter_name,
                 "principal_point": [camera.cx_px, camera.cy_px],
                 "focal_length": [camera.fx_px, camera.fy_px],
                 "radial_coeffs": [0.0] * 6,
@@ -252,16 +251,6 @@ def rig_from_camera(
     driven = driven_road(log.corrected(scene.cameras.path))
     rig = driven.driven_on(torch.tensor([view.timestamp_ns])).world_from_body[0]
     return invert_rigid(rig) @ camera.world_from_camera.double()
-
-
-def shutter_name(camera: Camera) -> str:
-    """How a camera reads its image, in the words of the interface."""
-    if camera.shutter is None or not camera.shutter.is_rolling:
-        return "GLOBAL"
-    columns_s, rows_s = camera.shutter.across_s
-    if abs(rows_s) >= abs(columns_s):
-        return "ROLLING_TOP_TO_BOTTOM" if rows_s > 0 else "ROLLING_BOTTOM_TO_TOP"
-    return "ROLLING_LEFT_TO_RIGHT" if columns_s > 0 else "ROLLING_RIGHT_TO_LEFT"
 
 
 def _exposure_us(view: RecordedView) -> list[int]:

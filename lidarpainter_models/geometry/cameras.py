@@ -99,6 +99,16 @@ class Camera:
         """Where the camera stands, metres."""
         return self.world_from_camera[:3, 3]
 
+    @property
+    def shutter_name(self) -> str:
+        """How the image is read, as simulators call it: `GLOBAL`, `ROLLING_TOP_TO_BOTTOM`, ..."""
+        if self.shutter is None or not self.shutter.is_rolling:
+            return "GLOBAL"
+        columns_s, rows_s = self.shutter.across_s
+        if abs(rows_s) >= abs(columns_s):
+            return "ROLLING_TOP_TO_BOTTOM" if rows_s > 0 else "ROLLING_BOTTOM_TO_TOP"
+        return "ROLLING_LEFT_TO_RIGHT" if columns_s > 0 else "ROLLING_RIGHT_TO_LEFT"
+
     def packed(self) -> Float[Tensor, "26"]:
         """What kernels read of a camera; float64.
 

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.export.simulator_bundle import shutter_name
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
@@ -256,7 +255,7 @@ def camera_message(name: str, camera: Camera) -> Message:
         logical_id=name,
         resolution_w=camera.width_px,
         resolution_h=camera.height_px,
-        shutter_type=getattr(sensorsim_pb2, shutter_name(camera)),
+        shutter_type=getattr(sensorsim_pb2, camera.shutter_name),
         opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
             principal_point_x=camera.cx_px,
             principal_point_y=camera.cy_px,

@@ -58,6 +58,11 @@ class ParkedActors:
         """Where they stand, in the order of the tracks."""
         return TrackPoses.of([*self.tracks.values()])
 
+    @cached_property
+    def row_of(self) -> dict[str, int]:
+        """Rows of `poses` by actor id."""
+        return {name: row for row, name in enumerate(self.tracks)}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moment:
@@ -170,10 +175,10 @@ def _check_strangers(
             f"dynamic object {strange[0]!r}{more}: the scene has no such actor; "
             "get_dynamic_objects lists those it has"
         )
-    row_of = {name: row for row, name in enumerate(known)}
     places = [place for place, name in enumerate(names) if name in known]
-    own = [row_of[names[place]] for place in places]
-    away_m = (middle[places] - parked.poses.all_at(taken_ns)[own])[:, :3, 3].norm(dim=1)
+    rows = torch.tensor([parked.row_of[names[place]] for place in places], dtype=torch.int64)
+    standing = parked.poses.at(rows, torch.full_like(rows, taken_ns))
+    away_m = (middle[places] - standing)[:, :3, 3].norm(dim=1)
     for place, moved_m in zip(places, away_m.tolist(), strict=True):
         if moved_m > PARKED_M:
             raise invalid(

@@ -145,15 +145,15 @@ class ServedScene:
         painter = None
         if self.streams is not None:
             painter = self.streams.painter(moment, self.builder, client)
-        image, trust = partial(self._image, request, moment, painter), partial(self.trust, request)
+        image = partial(self._image, request, moment, painter)
         if self.evidence is None:  # trust costs nothing then, and the image takes all threads
-            rgb, told = image(), trust(moment)
+            rgb, trust = image(), self.trust(request, moment)
         else:
-            rgb, told = both(image, partial(trust, moment), self.scene.device)
+            rgb, trust = both(image, partial(self.trust, request, moment), self.scene.device)
         if request.own_body_of is not None:
             rgb = torch.where(self._own_body(request)[..., None], 0.0, rgb)
         rgb_u8 = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return Frame(rgb_u8=rgb_u8, trust=told)
+        return Frame(rgb_u8=rgb_u8, trust=trust)
 
     def trust(self, request: SensorRequest, moment: Moment | None = None) -> Trust:
         """How far the image of a request can be trusted, before anybody paints it."""

@@ -53,6 +53,8 @@ def evaluate(
     Raises:
         ConfigError: the scene cannot be judged under this protocol.
     """
+    if protocol not in JUDGES:
+        raise ConfigError(f"no protocol {protocol!r}, expected one of {', '.join(JUDGES)}")
     this = opened(run)
     judge = JUDGES[protocol](this, config)
     painter = this.painter if view_time else None
