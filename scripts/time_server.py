@@ -36,22 +36,25 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     given = parser.parse_args()
     with connected(given.address, (given.scene,), width_px=given.width) as client:
-        moments = _moments(client, given.aside)
+        moments, beside = (_moments(client, given.aside + by_m) for by_m in (0.0, 0.1))
         names = tuple(client.cameras)
         first = names.index("front_camera") if "front_camera" in names else 0
 
-        def asking(count: int, width_px: int) -> Asked:
+        def asking(count: int, width_px: int, way: list[Any]) -> Asked:
             chosen = (names[first:] + names[:first])[:count]
             return lambda place: client.calls.batch_render_rgb(
-                _batch(client, chosen, moments[place % len(moments)], width_px), timeout=CALL_S
+                _batch(client, chosen, way[place % len(way)], width_px), timeout=CALL_S
             )
 
-        one = asking(1, given.width)
+        one, large = asking(1, given.width, moments), asking(1, LARGE_PX, beside)
+        together = f"{len(names)} cameras in one batch"
         _told("first image", [_milliseconds(one, 0)])
         for name, asked, count in (
             ("one camera", one, given.frames),
-            (f"{len(names)} cameras in one batch", asking(len(names), given.width), given.frames),
-            (f"one camera, {LARGE_PX} pixels wide", asking(1, LARGE_PX), 6),
+            ("one camera, again", asking(1, given.width, beside), given.frames),
+            (together, asking(len(names), given.width, moments), given.frames),
+            (f"{together}, again", asking(len(names), given.width, beside), given.frames),
+            (f"one camera, {LARGE_PX} pixels wide", large, 6),
         ):
             asked(0)
             places = islice(cycle(range(1, len(moments))), count)
