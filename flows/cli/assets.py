@@ -32,8 +32,10 @@ file: File to import: {import_help()}.
 import_.category: Category of what it shows, such as car.
 size: Length, width and height in metres, as 4.5,1.8,1.5; the file is scaled to this length. As the
   file has it if absent.
-up: Axis of the file that is up; as the file says if absent, else z of PLY and y of other files.
-forward: Axis of the file along which its front is; along the longest horizontal side if absent.
+up: Axis of the file that is up: x, -x, y, -y, z or -z; as the file says or its format has it if
+  absent.
+forward: Axis of the file along which its front is: x, -x, y, -y, z or -z; that of the longest
+  horizontal side if absent.
 import_.licence: Terms of the file, which hold for the asset.
 runs: Runs, each by its id or the beginning of it, a scene such as pandaset/002 (its newest run), or
   latest (the newest run of all).

@@ -69,6 +69,7 @@ class ForeignFolder:
         Raises:
             DataError: it leads out of the folder, is not there, or is too large with all others.
         """
+        before, self.problem = self.problem, f"{self.file}: names {name[:200]!r}, which is no file"
         path = (self.file.parent / name.strip().replace("\\", "/")).resolve()
         if not path.is_relative_to(self.file.parent):
             self.problem = f"{self.file}: names {name[:200]!r}, expected a file of its own folder"
@@ -79,6 +80,7 @@ class ForeignFolder:
         else:
             content = path.read_bytes()
             self.digests[path] = hashlib.sha256(content).hexdigest()
+            self.problem = before
             return content
         raise DataError(self.problem)
 

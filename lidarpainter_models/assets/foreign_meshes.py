@@ -11,22 +11,27 @@ from lidarpainter_models.assets.foreign_files import UNREADABLE, ForeignFolder, 
 from lidarpainter_models.errors import DataError
 
 SPLATS = "; Gaussians are imported as PLY or SPZ"
-MOST_TRIANGLES = 20_000_000
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tga", ".bmp", ".dds", ".ktx2")
+MOST_TRIANGLES = 5_000_000
 """Of all parts, each as often as it is shown."""
 
 
-def read_meshes(folder: ForeignFolder) -> ForeignShape:
+def read_meshes(folder: ForeignFolder, *, is_textured: bool = False) -> ForeignShape:
     """All triangles of a file, with what their colours come from.
 
+    Where the file `is_textured`, or has read an image, one must have come through.
+
     Raises:
-        DataError: it cannot be read, holds no triangles or too many, or names what is not there or
-            not in its folder.
+        DataError: it cannot be read, holds no triangles or too many, has lost its textures, or
+            names what is not there or not in its folder.
     """
     import trimesh
 
     ending, parts, count = folder.file.suffix.lower().removeprefix("."), [], 0
     try:
-        scene = trimesh.load_scene(BytesIO(folder.content), file_type=ending, resolver=folder)
+        content = BytesIO(folder.content)
+        # processing would drop vertices that are no numbers
+        scene = trimesh.load_scene(content, file_type=ending, resolver=folder, process=False)
         for node in scene.graph.nodes_geometry:
             pose, name = scene.graph[node]
             mesh = scene.geometry[name]
@@ -40,6 +45,12 @@ def read_meshes(folder: ForeignFolder) -> ForeignShape:
         raise DataError(folder.problem)
     if not parts or count > MOST_TRIANGLES:
         raise DataError(f"{folder.file}: {count} triangles, expected 1 to {MOST_TRIANGLES}{SPLATS}")
+    # trimesh passes over images that it cannot read
+    if is_textured or any(one.suffix.lower() in IMAGES for one in folder.digests):
+        materials = [getattr(mesh.visual, "material", None) for mesh in parts]
+        colours = ("image", "baseColorTexture")
+        if not any(getattr(one, name, None) for one in materials for name in colours):
+            raise DataError(f"{folder.file}: its textures cannot be read, expected PNG or JPEG")
     return ForeignShape(meshes=parts)
 
 
@@ -53,10 +64,13 @@ def read_gltf(folder: ForeignFolder) -> ForeignShape:
     try:
         if content.startswith(b"glTF"):
             content = content[20 : 20 + struct.unpack_from("<I", content, 12)[0]]
-        columns = json.loads(content)["accessors"]
+        document = json.loads(content)
+        columns, materials = document["accessors"], document.get("materials", ())
+        colours = [one.get("pbrMetallicRoughness", {}) for one in materials]
         are_plain = all("bufferView" in one and "sparse" not in one for one in columns)
     except (*UNREADABLE, struct.error) as error:
         raise DataError(f"{folder.file}: no readable glTF file ({error!r:.200})") from None
     if not are_plain:
         raise DataError(f"{folder.file}: has packed columns, expected plain triangles")
-    return replace(read_meshes(folder), up="y", is_linear=True)
+    is_textured = any("baseColorTexture" in one for one in colours)
+    return replace(read_meshes(folder, is_textured=is_textured), up="y", is_linear=True)
