@@ -21,7 +21,7 @@ MOST_BYTES = 512 * 2**20
 """Of all files of one asset."""
 UNREADABLE = (
     *(ArithmeticError, AssertionError, AttributeError, ImportError, LookupError, MemoryError),
-    *(OSError, RuntimeError, TypeError, ValueError),
+    *(OSError, RuntimeError, SyntaxError, TypeError, ValueError),
 )
 """What readers of other people raise about a damaged file."""
 

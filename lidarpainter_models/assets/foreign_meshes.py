@@ -4,11 +4,15 @@ import json
 import struct
 from dataclasses import replace
 from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidarpainter_models.assets.foreign_files import UNREADABLE, ForeignFolder, ForeignShape
 from lidarpainter_models.errors import DataError
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 SPLATS = "; Gaussians are imported as PLY or SPZ"
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tga", ".bmp", ".dds", ".ktx2")
@@ -27,17 +31,18 @@ def read_meshes(folder: ForeignFolder, *, is_textured: bool = False) -> ForeignS
     """
     import trimesh
 
+    asked: Any = folder  # trimesh needs no more of a resolver
     ending, parts, count = folder.file.suffix.lower().removeprefix("."), [], 0
     try:
         content = BytesIO(folder.content)
         # processing would drop vertices that are no numbers
-        scene = trimesh.load_scene(content, file_type=ending, resolver=folder, process=False)
+        scene = trimesh.load_scene(content, file_type=ending, resolver=asked, process=False)
         for node in scene.graph.nodes_geometry:
             pose, name = scene.graph[node]
             mesh = scene.geometry[name]
             count += len(getattr(mesh, "faces", ()))
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) and count <= MOST_TRIANGLES:
-                parts.append(mesh.copy().apply_transform(np.asarray(pose, float)))
+                parts.append(checked_part(mesh).apply_transform(np.asarray(pose, float)))
     except UNREADABLE as error:
         reason = folder.problem or f"{folder.file}: cannot be read as {ending} ({error!r:.200})"
         raise DataError(reason) from None
@@ -52,6 +57,21 @@ def read_meshes(folder: ForeignFolder, *, is_textured: bool = False) -> ForeignS
         if not any(getattr(one, name, None) for one in materials for name in colours):
             raise DataError(f"{folder.file}: its textures cannot be read, expected PNG or JPEG")
     return ForeignShape(meshes=parts)
+
+
+def checked_part(mesh: "Trimesh") -> "Trimesh":
+    """A copy, of which all that is read later could be read.
+
+    Raises:
+        ValueError: vertices or places on its texture lack, or lack numbers.
+        Exception: any of `UNREADABLE`: a corner that is not there, an image that breaks off.
+    """
+    own = mesh.copy()  # with its images
+    uv = getattr(own.visual, "uv", None)
+    uv = np.zeros((len(own.vertices), 2)) if uv is None else uv
+    if own.triangles.shape[1:] != (3, 3) or len(uv) != len(own.vertices) or uv.shape[1] < 2:
+        raise ValueError("vertices, or their places on a texture, of too few numbers")
+    return own
 
 
 def read_gltf(folder: ForeignFolder) -> ForeignShape:

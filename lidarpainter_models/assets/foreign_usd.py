@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lidarpainter_models.assets.foreign_files import UNREADABLE, ForeignFolder, ForeignShape
-from lidarpainter_models.assets.foreign_meshes import MOST_TRIANGLES, SPLATS
+from lidarpainter_models.assets.foreign_meshes import MOST_TRIANGLES, SPLATS, checked_part
 from lidarpainter_models.errors import DataError, MissingPackageError
 
 COLOURS = ("diffuseColor", "diffuse_texture", "diffuse_color_constant")
@@ -40,9 +40,10 @@ def read_usd(folder: ForeignFolder) -> ForeignShape:
         _look_up(folder)
         stage = Usd.Stage.Open(str(folder.file))
         meshes = list(_Stage(stage, folder, Usd.TimeCode.EarliestTime()).parts())
-    except (*UNREADABLE, Tf.ErrorException) as error:
-        reason = " ".join(str(error).split())[-200:]
-        raise DataError(folder.problem or f"{folder.file}: no readable USD: {reason}") from None
+    except DataError:
+        raise
+    except (*UNREADABLE, Tf.ErrorException):  # what USD says need not be text
+        raise DataError(folder.problem or f"{folder.file}: no readable USD file") from None
     finally:
         said.TakeUncoalescedDiagnostics()
     if not meshes:
@@ -83,7 +84,7 @@ class _Stage:
             pose = np.array(poses.GetLocalToWorldTransform(prim)).T
             for part in self._of(UsdGeom.Mesh(prim)) if self._is_drawn(prim) else ():
                 count += len(part.faces)
-                yield part.apply_transform(pose)
+                yield checked_part(part).apply_transform(pose)
             count += 1
             if count > MOST_TRIANGLES:
                 raise DataError(f"{self.folder.file}: more than {MOST_TRIANGLES} triangles")

@@ -24,10 +24,12 @@ from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
 
-LONGEST_M = {"car": (2, 8), "pickup": (3, 9), "van": (3, 12), "truck": (3, 30), "bus": (4, 30)}
-LONGEST_M |= {"motorcycle": (1, 4), "bicycle": (0.8, 4), "pedestrian": (0.5, 2.6)}
+LONGEST_M: dict[str, tuple[float, float]] = {
+    **{"car": (2, 8), "pickup": (3, 9), "van": (3, 12), "truck": (3, 30), "bus": (4, 30)},
+    **{"motorcycle": (1, 4), "bicycle": (0.8, 4), "pedestrian": (0.5, 2.6)},
+}
 """Least and most of the longest side, by category."""
-ANY_LONGEST_M = (0.05, 60)
+ANY_LONGEST_M = (0.05, 60.0)
 FLATTEST = 0.01
 """Share of the longest side that every other must reach."""
 MOST_UNLIKE = 1.25
@@ -138,13 +140,16 @@ def _bounds(
     points: Float[Tensor, "points 3"], shape: ForeignShape
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Lowest and highest corner of the box, in the unit of the file."""
-    if shape.size_m is not None:
-        half = torch.tensor(shape.size_m).double() / 2
-        return -half, half
     if shape.gaussians is None:
         return points.amin(0), points.amax(0)
     # a stray Gaussian is no part of the body
-    return points.quantile(0.005, dim=0), points.quantile(0.995, dim=0)
+    low, high = points.quantile(0.005, dim=0), points.quantile(0.995, dim=0)
+    if shape.size_m is None:
+        return low, high
+    half = torch.tensor(shape.size_m).double() / 2
+    if bool((torch.maximum(-low, high) > MOST_UNLIKE * half).any()):
+        raise DataError(f"reaches out of the box of {_told(2 * half)} m that it says")
+    return -half, half
 
 
 def _size(
@@ -167,7 +172,7 @@ def _size(
     least, most = LONGEST_M.get(said.category, ANY_LONGEST_M)
     if not least <= float(size_m.max()) <= most:
         raise DataError(
-            f"{_told(size_m)} m, expected {least} to {most} m for the longest side of a "
+            f"{_told(size_m)} m, expected {least:g} to {most:g} m for the longest side of a "
             f"{said.category}: --size says how large it is"
         )
     return size_m, factor

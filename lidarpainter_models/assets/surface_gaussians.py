@@ -135,7 +135,9 @@ def _seen_from_outside(places: Places, solid: Sequence["Trimesh"]) -> Bool[np.nd
     scene = open3d.t.geometry.RaycastingScene()
     for mesh in solid:
         vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
-        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(faces))
+        scene.add_triangles(
+            open3d.core.Tensor.from_numpy(vertices), open3d.core.Tensor.from_numpy(faces)
+        )
     seen, number = np.zeros(len(places), bool), np.arange(NUM_DIRECTIONS) + 0.5
     up, turn = 1 - 2 * number / NUM_DIRECTIONS, number * np.pi * (1 + 5**0.5)
     flat = np.sqrt(1 - up**2)
@@ -144,7 +146,9 @@ def _seen_from_outside(places: Places, solid: Sequence["Trimesh"]) -> Bool[np.nd
         points, normals = places[rows, :3], places[rows, 3:6]
         starts = points + LIFT_M * np.sign(normals @ away)[:, None] * normals
         rays = np.concatenate([starts, np.broadcast_to(away, starts.shape)], axis=1)
-        hidden = scene.test_occlusions(open3d.core.Tensor(rays.astype(np.float32))).numpy()
+        hidden = scene.test_occlusions(
+            open3d.core.Tensor.from_numpy(rays.astype(np.float32))
+        ).numpy()
         seen[rows] = ~hidden
     return seen
 

@@ -20,10 +20,9 @@ from lidarpainter_models.assets.asset_files import (
 )
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.export.contents import ExportedActor, SceneContents
+from lidarpainter_models.export.contents import SceneContents
 from lidarpainter_models.export.formats import FORMATS, ExportFormat, export_format
 from lidarpainter_models.export.gallery import DATA, PAGE, write_gallery
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.ply_files import write_ply
 from tasks.exports.places import new_folder
 
@@ -71,21 +70,15 @@ def _write(model: ActorModel, asset: Row, row: ExportFormat, out: Path) -> None:
         said = (named, f"{SIZE_COMMENT} {size}", FRAME, asset["licence"])
         write_ply(out, model.gaussians, [" ".join(str(one).split()) for one in said])
         return
-    alone = ExportedActor(
-        actor_id=asset["name"],
-        category=asset["category"],
-        size_m=model.size_m,
-        gaussians=model.gaussians,
-    )
-    contents = SceneContents(
+    alone = SceneContents(
         name=asset["name"],
-        street=GaussianSet.empty(sh_degree=model.gaussians.sh_degree),
-        actors=(alone,),
+        street=model.gaussians,
+        actors=(),
         timestamps_ns=torch.zeros(1, dtype=torch.int64),
-        world_from_actor=torch.eye(4, dtype=torch.float64)[None, None],
-        is_present=torch.ones(1, 1, dtype=torch.bool),
+        world_from_actor=torch.zeros(1, 0, 4, 4, dtype=torch.float64),
+        is_present=torch.zeros(1, 0, dtype=torch.bool),
     )
-    row.load_writer()(out, contents)
+    row.load_writer()(out, alone)
 
 
 def export_gallery(store: Store, assets: Sequence[Row], out: Path) -> dict[str, Any]:

@@ -165,6 +165,9 @@ def test_splats_of_half_a_car_keep_the_box_that_the_file_says(tmp_path):
     again = taken(tmp_path / "half.ply")
     assert torch.allclose(again.gaussians.means, left.means, atol=1e-5)
     assert again.size_m.tolist() == pytest.approx([4.5, 1.8, 1.5])
+    write_ply(tmp_path / "half.ply", left, ["size_m 2.1000 1.8000 1.5000"])
+    with pytest.raises(DataError, match=r"reaches out of the box of 2.1 x 1.8 x 1.5 m"):
+        taken(tmp_path / "half.ply")
 
 
 def test_a_texture_is_part_of_what_a_file_is(tmp_path):
@@ -296,6 +299,24 @@ def test_what_would_do_harm_is_refused_in_a_line(name, tmp_path):
     with pytest.raises(DataError, match=expected) as found:
         taken(path)
     assert len(str(found.value)) < 700
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_come_in_or_are_refused_in_a_line(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(surface_gaussians, "MOST", 300)
+    path, random = WRITERS[name](tmp_path / name), np.random.default_rng(0)
+    whole, refusals = path.read_bytes(), []
+    for _ in range(25):
+        content = bytearray(whole)
+        for place in random.integers(0, min(len(content), 900), 3):
+            content[place : place + 1] = [b"9999", b"\xff", b"nan", b"../"][place % 4]
+        path.write_bytes(content)
+        try:
+            taken(path)
+        except DataError as error:
+            refusals.append(str(error))
+    assert refusals
+    assert not [said for said in refusals if "\n" in said]
 
 
 def test_what_grows_beyond_reason_is_refused(tmp_path, monkeypatch):

@@ -45,11 +45,12 @@ def painted(mesh, rgba):
     return mesh
 
 
-def write_glb(path, **changed):
-    """As glTF, y up, z ahead; glass is see-through. `changed` sizes stretch all of it."""
+def write_glb(path, *, scale=1.0):
+    """As glTF, y up, z ahead; glass is see-through."""
     scene = trimesh.Scene()
     for name, mesh, rgba in boxes():
-        mesh.apply_transform(GLTF_FROM_BOX).apply_scale(changed.get("scale", 1.0))
+        mesh.apply_transform(GLTF_FROM_BOX)
+        mesh.apply_scale(scale)
         mode = "BLEND" if rgba[3] < 1 else "OPAQUE"
         mesh.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=rgba, alphaMode=mode))
         scene.add_geometry(mesh, node_name=name, geom_name=name)
