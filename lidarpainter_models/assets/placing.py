@@ -25,8 +25,14 @@ from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_fro
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
 
 LONGEST_M: dict[str, tuple[float, float]] = {
-    **{"car": (2, 8), "pickup": (3, 9), "van": (3, 12), "truck": (3, 30), "bus": (4, 30)},
-    **{"motorcycle": (1, 4), "bicycle": (0.8, 4), "pedestrian": (0.5, 2.6)},
+    "car": (2, 8),
+    "pickup": (3, 9),
+    "van": (3, 12),
+    "truck": (3, 30),
+    "bus": (4, 30),
+    "motorcycle": (1, 4),
+    "bicycle": (0.8, 4),
+    "pedestrian": (0.5, 2.6),
 }
 """Least and most of the longest side, by category."""
 ANY_LONGEST_M = (0.05, 60.0)

@@ -1,6 +1,5 @@
 """Other people's files in the library: entered, found, exported, and driving in a scene."""
 
-
 import pytest
 from commands import refuse, succeed
 from foreign_cars import SIZE_M, write_glb, write_obj

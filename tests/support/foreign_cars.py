@@ -3,6 +3,8 @@
 Its left side bears a yellow plate, so that whoever mirrors or turns it is found out.
 """
 
+from typing import Any
+
 import numpy as np
 import trimesh
 from PIL import Image
@@ -52,8 +54,9 @@ def write_glb(path, *, scale=1.0):
         mesh.apply_transform(GLTF_FROM_BOX)
         mesh.apply_scale(scale)
         mode = "BLEND" if rgba[3] < 1 else "OPAQUE"
-        mesh.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=rgba, alphaMode=mode))
-        scene.add_geometry(mesh, node_name=name, geom_name=name)
+        material = PBRMaterial(baseColorFactor=rgba, alphaMode=mode)
+        part = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=TextureVisuals(material=material))
+        scene.add_geometry(part, node_name=name, geom_name=name)
     path.parent.mkdir(parents=True, exist_ok=True)
     scene.export(path)
     return path
@@ -77,7 +80,7 @@ def write_obj(path):
         np.full((len(mesh.vertices), 2), ((number + 0.5) / len(names), 0.5))
         for number, mesh in enumerate(parts)
     ]
-    whole = trimesh.util.concatenate([trimesh.Trimesh(m.vertices, m.faces) for m in parts])
+    whole: Any = trimesh.util.concatenate([trimesh.Trimesh(m.vertices, m.faces) for m in parts])
     material = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
     whole.visual = TextureVisuals(np.concatenate(uv), material)
     path.parent.mkdir(parents=True, exist_ok=True)
