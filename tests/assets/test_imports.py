@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from foreign_cars import SIZE_M, WRITERS, write_glb, write_obj, write_usd
+from foreign_cars import SIZE_M, WRITERS, write_glb, write_obj, write_usd, write_usd_quads
 from PIL import Image
 
 from lidarpainter_models.assets import foreign_files, foreign_meshes, surface_gaussians
@@ -69,6 +69,15 @@ def test_what_lies_inside_is_left_out_unless_glass_shows_it(tmp_path):
     assert len(seat) > 50
     glass = model.gaussians.opacity < 0.3
     assert 0.05 < glass.float().mean() < 0.6
+
+
+def test_quads_and_subsets_of_usd_keep_their_materials(tmp_path):
+    model = taken(write_usd_quads(tmp_path / "box.usda"), category="thing")
+    assert model.size_m.tolist() == pytest.approx([4, 2, 1.5])
+    is_red = model.gaussians.base_rgb[:, 0] > 0.5
+    on_top = model.gaussians.means[:, 2] > 0.75 - 1e-4
+    assert torch.equal(is_red, on_top)
+    assert is_red.float().mean() == pytest.approx(8 / 34, abs=0.01)  # by area
 
 
 def long_side(path, rgba):

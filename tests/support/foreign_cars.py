@@ -166,3 +166,34 @@ WRITERS = {
     "car.usdz": write_usdz,
 }
 """By the name of the file."""
+
+
+def write_usd_quads(path):
+    """A box of quads, y up, in metres: its top is red by a subset, all else green."""
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    box = UsdGeom.Mesh.Define(stage, "/Box")
+    corners = [(x, y, z) for x in (-1, 1) for y in (-0.75, 0.75) for z in (-2, 2)]
+    box.GetPointsAttr().Set([Gf.Vec3f(*map(float, one)) for one in corners])
+    quads = [(2, 3, 7, 6), (0, 4, 5, 1), (0, 1, 3, 2), (4, 6, 7, 5), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box.GetFaceVertexCountsAttr().Set([4] * 6)
+    box.GetFaceVertexIndicesAttr().Set([corner for quad in quads for corner in quad])
+    top = UsdGeom.Subset.CreateGeomSubset(box, "top", UsdGeom.Tokens.face, [0])
+    UsdShade.MaterialBindingAPI.Apply(box.GetPrim()).SetMaterialBindSubsetsFamilyType(
+        UsdGeom.Tokens.nonOverlapping
+    )
+    top.GetFamilyNameAttr().Set("materialBind")
+    for prim, rgb in ((top.GetPrim(), (0.8, 0, 0)), (box.GetPrim(), (0, 0.8, 0))):
+        place = f"/Looks{prim.GetPath().name}"
+        material = UsdShade.Material.Define(stage, place)
+        shader = UsdShade.Shader.Define(stage, f"{place}/Shader")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*rgb))
+        output = shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+        material.CreateSurfaceOutput().ConnectToSource(output)
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+    stage.Save()
+    return path
