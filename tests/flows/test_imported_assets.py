@@ -1,5 +1,6 @@
 """Other people's files in the library: entered, found, exported, and driving in a scene."""
 
+import numpy as np
 import pytest
 from commands import refuse, succeed
 from foreign_cars import SIZE_M, write_glb, write_obj
@@ -72,12 +73,17 @@ def test_an_asset_goes_out_in_every_format_with_its_box(library, asset, tmp_path
     assert b"comment size_m 4.5000 1.8000 1.5000\n" in (tmp_path / "a.ply").read_bytes()
     document = GLTF2().load(tmp_path / "a.glb")
     (primitive,) = document.meshes[0].primitives
-    assert document.accessors[primitive.attributes.POSITION].count == len(exact)
+    position = document.accessors[primitive.attributes.POSITION]
+    assert position.count == len(exact)
+    assert position.max == pytest.approx(exact.means.amax(0).tolist())  # in our box frame
     stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     fields = [one for one in stage.Traverse() if "ParticleField" in one.GetTypeName()]
-    counts = [len(one.GetAttribute("positions").Get() or ()) for one in fields]
-    assert max(counts) == len(exact)
+    (field,) = fields
+    assert np.allclose(field.GetAttribute("positions").Get(), exact.means)
+    assert np.allclose(field.GetAttribute("opacities").Get(), exact.opacity, atol=1e-6)
+    sh = np.array(field.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get())
+    assert np.allclose(sh, exact.sh[:, 0], atol=1e-6)
     for name in ("a.ply", "a.spz"):
         again = imported(library, tmp_path / name, "--category", "car")
         assert again["asset_id"] != asset["asset_id"]
