@@ -9,6 +9,8 @@ import typer
 from flows.cli.output import print_json, print_pairs, print_result, print_table, say_status
 from flows.cli.rows import opened_row, row_cell, told_explanation
 from flows.cli.shared_options import AsJson, described, named_run, parse_names
+from lidarpainter_models.assets.import_formats import Axis, import_help
+from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
     from catalog.sql import CatalogSql
@@ -25,7 +27,16 @@ SortName = Literal[  # `catalog.asset_queries.Sort`, known before anything is im
 
 app = typer.Typer(help="Actors, streets and skies for use elsewhere.", no_args_is_help=True)
 
-WORDS = """
+WORDS = f"""
+file: File to import: {import_help()}.
+import_.category: Category of what it shows, such as car.
+size: Length, width and height in metres, as 4.5,1.8,1.5; the file is scaled to this length. As the
+  file has it if absent.
+up: Axis of the file that is up: x, -x, y, -y, z or -z; as the file says or its format has it if
+  absent.
+forward: Axis of the file along which its front is: x, -x, y, -y, z or -z; that of the longest
+  horizontal side if absent.
+import_.licence: Terms of the file, which hold for the asset.
 runs: Runs, each by its id or the beginning of it, a scene such as pandaset/002 (its newest run), or
   latest (the newest run of all).
 kind: Kind of the assets: actor, street, sky or trajectory; all if absent.
@@ -48,7 +59,7 @@ limit: The maximum number of rows.
 gallery.limit: The maximum number of assets, of which the best are taken.
 name: The asset: its id, or the beginning of it.
 sql: One SELECT over the tables of the catalog, in DuckDB's SQL.
-format_: Format of the file: ply, spz or gltf (a .glb file).
+format_: Format of the file: ply, spz, gltf (a .glb file) or usd.
 out: File that the asset is written to.
 gallery.out: Folder that the gallery is written to: a new one, or an older gallery.
 """
@@ -74,6 +85,49 @@ def publish(runs: list[str], as_json: AsJson = False) -> None:
         return
     columns = ("run_id", "scene", "style", "num_actor", "num_street", "num_assets", "seconds")
     print_table("published", columns, [[one[name] for name in columns] for one in results])
+
+
+@app.command("import")
+@described(WORDS)
+def import_(
+    file: Path,
+    category: Annotated[str, typer.Option()],
+    size: str | None = None,
+    up: Axis | None = None,
+    forward: Axis | None = None,
+    licence: str | None = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take splats or a mesh of somebody else into the library, as an actor.
+
+    Example: lidarpainter assets import taxi.glb --category car --licence "CC BY 4.0"
+    """
+    from catalog.store import open_store
+    from lidarpainter_models.scenes.categories import category_of
+
+    size_m = None if size is None else parse_size(size)
+    say_status(f"importing {file.name}")
+    from lidarpainter_models.assets.placing import Placement
+    from tasks.assets.import_file import import_file
+
+    placement = Placement(category=category_of(category), size_m=size_m, up=up, forward=forward)
+    store = open_store()
+    store.make()
+    result = import_file(store, file.absolute(), placement, licence)
+    print_result(f"asset {result['asset_id']}", result, as_json=as_json)
+
+
+def parse_size(text: str) -> tuple[float, float, float]:
+    """Three lengths in metres with commas between.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    try:
+        length_m, width_m, height_m = (float(side) for side in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--size {text!r}: expected three metres, as 4.5,1.8,1.5") from None
+    return length_m, width_m, height_m
 
 
 @app.command("list")

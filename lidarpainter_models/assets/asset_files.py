@@ -22,6 +22,8 @@ GAUSSIANS_FILE = "gaussians.ply"
 POINTS_FILE = "points.safetensors"
 ABOUT_FILE = "asset.json"
 FRAME = "box frame: x along the length, y left, z up, origin at the centre; metres"
+SIZE_COMMENT = "size_m"
+"""Begins the comment of an exported PLY file that says length, width and height."""
 
 
 def write_asset(folder: Path, model: ActorModel, about: Mapping[str, Any]) -> None:

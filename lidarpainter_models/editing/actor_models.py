@@ -178,7 +178,7 @@ def sampled_points(gaussians: GaussianSet) -> MapPoints:
     bare = MapPoints.uncoloured(
         xyz_m=gaussians.means[rows].contiguous(),
         frame_index=zeros,
-        timestamp_ns=zeros,
+        timestamp_ns=zeros.clone(),  # files of tensors refuse what shares memory
         range_m=torch.full((len(rows),), 10.0),
     )
     return replace(bare, rgb_u8=rgb_u8, has_colour=torch.ones(len(rows), dtype=torch.bool))

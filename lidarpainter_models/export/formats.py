@@ -109,6 +109,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         endings=(".usdz", ".usdc", ".usda"),
         options=_WHEN,
         is_moving=True,
+        takes_assets=True,
     ),
     ExportFormat(
         name="colmap",

@@ -12,13 +12,18 @@ from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError, UnknownRecordError
 from catalog.store import Store
 from catalog.tables import Row
-from lidarpainter_models.assets.asset_files import FRAME, GAUSSIANS_FILE
+from lidarpainter_models.assets.asset_files import (
+    FRAME,
+    GAUSSIANS_FILE,
+    SIZE_COMMENT,
+    read_asset,
+)
+from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.contents import SceneContents
 from lidarpainter_models.export.formats import FORMATS, ExportFormat, export_format
 from lidarpainter_models.export.gallery import DATA, PAGE, write_gallery
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.ply_files import read_ply, write_ply
+from lidarpainter_models.gaussians.model.ply_files import write_ply
 from tasks.exports.places import new_folder
 
 
@@ -45,27 +50,29 @@ def export_asset(store: Store, asset: Row, wanted: str, out: Path) -> dict[str, 
         raise ConfigError(
             f"a {asset['kind']} has no Gaussians to export; its files are in {folder}"
         )
-    gaussians = read_ply(folder / GAUSSIANS_FILE)
-    _write(gaussians, asset, row, out)
+    model = read_asset(folder)
+    _write(model, asset, row, out)
     return {
         "asset_id": asset["asset_id"],
         "path": str(out),
         "num_bytes": out.stat().st_size,
-        "num_gaussians": len(gaussians),
+        "num_gaussians": len(model.gaussians),
         "frame": FRAME,
         "licence": asset["licence"],
     }
 
 
-def _write(gaussians: GaussianSet, asset: Row, row: ExportFormat, out: Path) -> None:
-    """Write the Gaussians of an asset; a PLY file says in comments whose they are."""
+def _write(model: ActorModel, asset: Row, row: ExportFormat, out: Path) -> None:
+    """Write an asset alone, with its box; a PLY file says in comments whose it is."""
     if row.name == "ply":
-        said = (f"asset {asset['asset_id']}, {asset['category']}", FRAME, asset["licence"])
-        write_ply(out, gaussians, [" ".join(str(one).split()) for one in said])
+        size = " ".join(f"{side:.4f}" for side in model.size_m.tolist())
+        named = f"asset {asset['asset_id']}, {asset['category']}"
+        said = (named, f"{SIZE_COMMENT} {size}", FRAME, asset["licence"])
+        write_ply(out, model.gaussians, [" ".join(str(one).split()) for one in said])
         return
     alone = SceneContents(
         name=asset["name"],
-        street=gaussians,
+        street=model.gaussians,
         actors=(),
         timestamps_ns=torch.zeros(1, dtype=torch.int64),
         world_from_actor=torch.zeros(1, 0, 4, 4, dtype=torch.float64),
