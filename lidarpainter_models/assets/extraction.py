@@ -264,12 +264,10 @@ def turntable(
     The azimuth grows to the left: ahead, ahead left, left, ... The camera is so far away that a
     box of this size fits.
     """
-    radius_m = float(size_m.norm()) / 2
-    distance_m = radius_m * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
     pictures = []
     for number in range(NUM_AZIMUTHS):
         azimuth = 2 * math.pi * number / NUM_AZIMUTHS
-        camera = _looking_in(azimuth, math.radians(elevation_deg), distance_m)
+        camera = camera_around(azimuth, math.radians(elevation_deg), size_m)
         bodies = invert_rigid(camera.world_from_camera)[None].float()
         with torch.no_grad():
             image = draw_gaussians(gaussians, bodies, camera)
@@ -277,8 +275,9 @@ def turntable(
     return torch.cat(pictures, dim=1).clamp(0, 1)
 
 
-def _looking_in(azimuth_rad: float, elevation_rad: float, distance_m: float) -> Camera:
-    """A camera on a circle around the origin that looks at it."""
+def camera_around(azimuth_rad: float, elevation_rad: float, size_m: Float[Tensor, "3"]) -> Camera:
+    """A camera that looks at the origin from so far away that a box of this size fits."""
+    distance_m = float(size_m.norm()) / 2 * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
     flat = math.cos(elevation_rad)
     away = torch.tensor(
         [flat * math.cos(azimuth_rad), flat * math.sin(azimuth_rad), math.sin(elevation_rad)],
