@@ -24,7 +24,6 @@ from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from catalog.artefacts import ArtefactRef
 from catalog.store import Store, open_store
 from flows.assets import publish_run
 from lidarpainter_models.assets.asset_files import ABOUT_FILE, read_asset

@@ -7,7 +7,7 @@ neutral exposure: multiplied so that the road where it was recorded is of one gr
 import csv
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.assets.asset_files import write_asset
+from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
+from lidarpainter_models.assets.whole_actors import whole_actor
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -61,6 +63,8 @@ class AssetSource:
     """Its Gaussians as they are shown, in a style if the run is in one."""
     sighted: Mapping[str, Sighting]
     """How well each actor was seen, by id."""
+    surfaces: Mapping[str, SeenSurface] = field(default_factory=dict)
+    """Surfaces of the vehicles, by id."""
     judged_on: str
     """Which images their errors are of."""
     global_from_world: Float[Tensor, "4 4"]
@@ -107,11 +111,13 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
             continue  # nothing of it was fitted
         if len(found.gaussians) < LEAST_GAUSSIANS:
             continue
-        model = found.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
+        whole = whole_actor(found, source.surfaces.get(track.actor_id))
+        model = whole.model.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
         folder = f"actors/{number:03d}"
-        measured = _measured(seen, source.judged_on)
+        shares = {f"{name}_share": share for name, share in whole.shares.items()}
+        measured = _measured(seen, source.judged_on) | shares
         looks = [[one.azimuth_deg, one.elevation_deg, one.distance_m] for one in seen.near_looks]
-        write_asset(output / folder, model, {**measured, "looks": looks})
+        write_asset(output / folder, model, {**measured, "looks": looks}, origin=whole.origin)
         yield {
             "kind": "actor",
             "category": track.category,
