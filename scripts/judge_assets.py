@@ -27,6 +27,7 @@ from torch import Tensor
 from catalog.store import Store, open_store
 from flows.assets import publish_run
 from lidarpainter_models.assets.asset_files import ABOUT_FILE, read_asset
+from lidarpainter_models.assets.expected_quality import directions
 from lidarpainter_models.assets.extraction import BACKGROUND, camera_around
 from lidarpainter_models.assets.sightings import box_view
 from lidarpainter_models.editing.actor_models import (
@@ -51,18 +52,10 @@ from tasks.runs import open_run
 VEHICLES = ("car", "van", "pickup")
 MOST_OF_RUN = 8
 LEAST_PIXELS_PER_M = 8.0
-NUM_AZIMUTHS = 12
-ELEVATIONS_DEG = (8.0, 30.0)
 NEAR_DEG = 30.0
 CLASSES = ("seen", "mirrored", "guessed")
 GOOD_IOU, GOOD_SCORE = 0.8, 0.7
 Line = dict[str, Any]
-
-
-def directions() -> list[tuple[float, float]]:
-    """Azimuth and elevation in degrees, those of one elevation after those of the other."""
-    step = 360 / NUM_AZIMUTHS
-    return [(step * turn, up) for up in ELEVATIONS_DEG for turn in range(NUM_AZIMUTHS)]
 
 
 def direction_class(azimuth_deg: float, looks: list[list[float]]) -> str:
@@ -80,16 +73,16 @@ def judged(
     """Every direction: its numbers, and what the asset looks like from there."""
     weight = model.gaussians.opacity[:, None]
     mean_rgb = (model.gaussians.base_rgb * weight).sum(0) / weight.sum()
-    for (azimuth, elevation), true in zip(directions(), truths, strict=True):
-        camera = camera_around(math.radians(azimuth), math.radians(elevation), model.size_m)
+    for (azimuth, elevation), true in zip(directions().tolist(), truths, strict=True):
+        camera = camera_around(azimuth, elevation, model.size_m)
         bodies = invert_rigid(camera.world_from_camera)[None].float()
         with torch.no_grad():
             drawn = draw_gaussians(model.gaussians, bodies, camera)
         rgb = (drawn.rgb.clamp(0, 1) + (1 - drawn.alpha[..., None]) * BACKGROUND).clamp(0, 1)
         line = {
-            "azimuth_deg": azimuth,
-            "elevation_deg": elevation,
-            "class": direction_class(azimuth, looks),
+            "azimuth_deg": round(math.degrees(azimuth), 3),
+            "elevation_deg": round(math.degrees(elevation), 3),
+            "class": direction_class(math.degrees(azimuth), looks),
             "iou": iou(drawn.alpha >= 0.5, true.is_covered),
             "psnr_db": psnr_db(rgb, true),
             "box_iou": iou(_box_mask(camera, model.size_m), true.is_covered),
@@ -145,7 +138,9 @@ def judge_run(store: Store, name: str, sheet: Path | None) -> Iterator[Line]:
         truths = [lone.render(camera) for camera in cameras(model.size_m)]
         found = list(judged(model, truths, about["looks"]))
         kept = {key: record.get(key) for key in ("actor_id", "is_moving", "score", "scene_id")}
-        for line, _ in found:
+        known = about.get("evidence", [None] * len(found))
+        for (line, _), evidence in zip(found, known, strict=True):
+            kept["evidence"] = evidence
             yield {**kept, "run_id": run.run_id, "car": f"{run.scene_id} {record['name']}", **line}
         if sheet is not None:
             write_png(
@@ -155,11 +150,11 @@ def judge_run(store: Store, name: str, sheet: Path | None) -> Iterator[Line]:
 
 def cameras(size_m: Float[Tensor, "3"]) -> list[Camera]:
     """Cameras of all directions, in the box frame."""
-    return [camera_around(*map(math.radians, one), size_m) for one in directions()]
+    return [camera_around(azimuth, up, size_m) for azimuth, up in directions().tolist()]
 
 
 def chosen(records: list[Line]) -> list[Line]:
-    """The vehicles of a run that are judged: those that its images show largest and least hidden."""
+    """The vehicles of a run that are judged: those shown largest and least hidden."""
     vehicles = [
         one
         for one in records

@@ -132,6 +132,8 @@ class WholeActor:
     model: ActorModel
     origin: Int[Tensor, " gaussians"]
     """Index in `ORIGINS`."""
+    surface: SeenSurface | None = None
+    """Of a vehicle that was made whole; its places are those of the Gaussians."""
 
     @property
     def shares(self) -> dict[str, float]:
@@ -149,4 +151,4 @@ def completed(model: ActorModel, surface: SeenSurface) -> WholeActor:
         rgb,
         sh_degree=model.gaussians.sh_degree,
     )
-    return WholeActor(model=replace(model, gaussians=gaussians), origin=origin)
+    return WholeActor(model=replace(model, gaussians=gaussians), origin=origin, surface=surface)

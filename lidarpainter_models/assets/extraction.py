@@ -16,6 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.assets.asset_files import write_asset
+from lidarpainter_models.assets.completion import WholeActor
+from lidarpainter_models.assets.expected_quality import (
+    directions,
+    evidence_of,
+    expected_psnr_db,
+    score_of,
+)
 from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
@@ -116,8 +123,11 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
         folder = f"actors/{number:03d}"
         shares = {f"{name}_share": share for name, share in whole.shares.items()}
         measured = _measured(seen, source.judged_on) | shares
+        expected = _expected(whole, seen)
+        measured["score"] = expected.get("score", seen.score)
         looks = [[one.azimuth_deg, one.elevation_deg, one.distance_m] for one in seen.near_looks]
-        write_asset(output / folder, model, {**measured, "looks": looks}, origin=whole.origin)
+        about = {**expected, **measured, "looks": looks}
+        write_asset(output / folder, model, about, origin=whole.origin)
         yield {
             "kind": "actor",
             "category": track.category,
@@ -131,6 +141,20 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
             "thumbnail": _turned(output, folder, model, elevation_deg=15.0),
             "world_from_asset": as_moving(track, source.world.log).world_from_box[0].double(),
         }
+
+
+def _expected(whole: WholeActor, seen: Sighting) -> Record:
+    """Of a vehicle that was made whole, how right it is expected to look; else nothing."""
+    if whole.surface is None:
+        return {}
+    evidence = evidence_of(whole, seen)
+    psnr_db = expected_psnr_db(evidence)
+    return {
+        "score": score_of(psnr_db),
+        "directions_deg": torch.rad2deg(directions()).tolist(),
+        "expected_psnr_db": psnr_db.tolist(),
+        "evidence": evidence.tolist(),
+    }
 
 
 def _measured(seen: Sighting, judged_on: str) -> Record:

@@ -40,6 +40,8 @@ class SeenSurface:
     weight: Float[Tensor, " places"]
     """Pixels per metre times the cosine of the look, squared, summed over looks; 0: never seen."""
     rgb_sum: Float[Tensor, "places 3"]
+    square_sum: Float[Tensor, " places"]
+    """Likewise of squares, the mean of the channels: it tells how far looks agree."""
 
     @classmethod
     def of(cls, model: ActorModel) -> "SeenSurface":
@@ -58,6 +60,7 @@ class SeenSurface:
             normals=normals,
             weight=torch.zeros(len(places)),
             rgb_sum=torch.zeros(len(places), 3),
+            square_sum=torch.zeros(len(places)),
         )
 
     def add_look(
@@ -94,7 +97,9 @@ class SeenSurface:
         kept, row, column = kept[is_open], row[is_open], column[is_open]
         weight = (facing[kept] * camera.fx_px / distance_m[kept]).square()
         self.weight.index_add_(0, kept, weight)
-        self.rgb_sum.index_add_(0, kept, weight[:, None] * rgb[row, column])
+        seen_rgb = rgb[row, column]
+        self.rgb_sum.index_add_(0, kept, weight[:, None] * seen_rgb)
+        self.square_sum.index_add_(0, kept, weight * seen_rgb.square().mean(1))
 
     @property
     def is_seen(self) -> Bool[Tensor, " places"]:
@@ -110,3 +115,9 @@ class SeenSurface:
     def rgb(self) -> Float[Tensor, "places 3"]:
         """Mean colours; of places that nobody saw they mean nothing."""
         return self.rgb_sum / self.weight.clamp(min=1e-6)[:, None]
+
+    @property
+    def disagreement(self) -> Float[Tensor, " places"]:
+        """Variance of the colours that looks show of a place, the mean of the channels."""
+        mean_square = self.square_sum / self.weight.clamp(min=1e-6)
+        return (mean_square - self.rgb.square().mean(1)).clamp(min=0)
