@@ -1,14 +1,17 @@
 """Train the shapes that complete vehicles: distances and materials of streets' cars.
 
-    python scripts/train_vehicle_shapes.py
+    python scripts/train_vehicle_shapes.py [--without KIND --out FILE]
 
 Writes `lidarpainter_models/assets/bundled/vehicle_shapes.safetensors` anew, with how it came to be
 in its header. Vehicles are the kinds of the synthetic street, each drawn many times with other
 proportions, so that no vehicle of a street is among them exactly. Equal code gives equal bytes.
+Without a kind, in another file, they tell what shapes are worth for vehicles of no known kind.
 """
 
+import argparse
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -166,9 +169,30 @@ def shares(points: np.ndarray, material: np.ndarray, size_m: np.ndarray) -> np.n
 
 def main() -> None:
     """Draw vehicles, and write the mean and the axes of their distances and materials."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--without", choices=sorted(SHAPES))
+    parser.add_argument("--out", type=Path, default=BUNDLED)
+    asked = parser.parse_args()
+    kinds = [shape for name, shape in SHAPES.items() if name != asked.without]
+    fields, materials = drawn(kinds)
+    table = torch.from_numpy(np.stack(fields))
+    tensors, kept = model_of(table, torch.from_numpy(np.stack(materials)))
+    header = {
+        "made_by": "scripts/train_vehicle_shapes.py",
+        "of": f"{len(kinds)} kinds of the synthetic street, {OF_EACH_KIND} of each, varied",
+        "seed": SEED,
+        "explained": round(kept, 4),
+    }
+    asked.out.parent.mkdir(exist_ok=True)
+    write_tensors(asked.out, tensors, header)
+    sys.stdout.write(f"{asked.out.stat().st_size} bytes, {kept:.1%} of the variance\n")
+
+
+def drawn(kinds: list[CarShape]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Distances (nodes) and shares of materials (nodes, materials) of vehicles of some kinds."""
     rng = np.random.default_rng(SEED)
     fields, materials = [], []
-    for shape in SHAPES.values():
+    for shape in kinds:
         for number in range(OF_EACH_KIND):
             one, surfaces = varied(shape, rng), SurfaceSet()
             atlas = add_car_surfaces(surfaces, one, drawn_from(SEED + number, MARKED_PAINT))
@@ -176,7 +200,11 @@ def main() -> None:
             points, uv, surface = surface_samples(mesh, rng)
             fields.append(signed_distances(points, size_m))
             materials.append(shares(points, material_of(surfaces, atlas, uv, surface), size_m))
-    table = torch.from_numpy(np.stack(fields))
+    return fields, materials
+
+
+def model_of(table: torch.Tensor, materials: torch.Tensor) -> tuple[dict[str, torch.Tensor], float]:
+    """What is stored of distances (vehicles, nodes) and shares, and how much that explains."""
     mean = table.mean(0)
     left, strength, axes = torch.linalg.svd(table - mean, full_matrices=False)
     deviation = strength[:NUM_AXES] / len(table) ** 0.5
@@ -185,22 +213,14 @@ def main() -> None:
     scaled = axes[:NUM_AXES] * deviation[:, None]
     latent = left[:, :NUM_SHARE_AXES] * len(table) ** 0.5
     known = torch.cat([torch.ones(len(latent), 1).double(), latent], dim=1)
-    found = torch.linalg.lstsq(known, torch.from_numpy(np.stack(materials)).flatten(1)).solution
+    found = torch.linalg.lstsq(known, materials.flatten(1)).solution
     per_node = found.reshape(1 + NUM_SHARE_AXES, *GRID, len(MATERIALS)).movedim(-1, 1)
     tensors = {
         "mean_m": mean.reshape(GRID).half(),
         "axes_m": scaled.reshape(NUM_AXES, *GRID).half(),
         "shares_i8": (per_node / SHARE_STEP).round().clamp(-127, 127).to(torch.int8).contiguous(),
     }
-    BUNDLED.parent.mkdir(exist_ok=True)
-    header = {
-        "made_by": "scripts/train_vehicle_shapes.py",
-        "of": f"{len(SHAPES)} kinds of the synthetic street, {OF_EACH_KIND} of each, varied",
-        "seed": SEED,
-        "explained": round(kept, 4),
-    }
-    write_tensors(BUNDLED, tensors, header)
-    sys.stdout.write(f"{BUNDLED.stat().st_size} bytes, {kept:.1%} of the variance\n")
+    return tensors, kept
 
 
 if __name__ == "__main__":

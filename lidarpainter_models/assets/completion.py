@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarpainter_models.assets.seen_surfaces import SPACING_M, SeenSurface
-from lidarpainter_models.editing.actor_models import ActorModel
+from lidarpainter_models.editing.actor_models import DARKEST, ActorModel
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 
@@ -119,7 +119,7 @@ def flat_gaussians(
         rotation_wxyz=quaternion_from_rotation(rotation),
         log_scale=scale_m.log().repeat(count, 1),
         opacity_logit=torch.full((count,), OPACITY).logit(),
-        sh_dc=sh_from_rgb(rgb.clamp(0, 1)),
+        sh_dc=sh_from_rgb(rgb.clamp(DARKEST, 1)),
         sh_rest=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
         body_index=torch.zeros(count, dtype=torch.int32),
     )

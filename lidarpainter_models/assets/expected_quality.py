@@ -30,7 +30,7 @@ EVIDENCE = ("one", "seen", "mirrored", "away", "fineness", "hidden", "contrast",
 - `contrast`: decimal logarithm of the variance of its colours: plain ones are easily right;
 - `disagreement`: decimal logarithm of the variance between looks at the same place.
 """
-COEFFICIENTS_DB = (10.0, 1.0, 0.5, -1.0, 0.3, -1.0, -5.0, -1.0)
+COEFFICIENTS_DB = (-5.403, 5.081, 0.141, 0.514, 1.644, -1.453, -7.828, -0.398)
 """In the order of `EVIDENCE`."""
 _LEAST_VARIANCE = 1e-4
 
