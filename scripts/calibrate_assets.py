@@ -62,9 +62,12 @@ def main() -> None:
     """Print what was fitted and what it is worth."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("judged", type=Path)
-    text = parser.parse_args().judged.read_text("utf-8")
+    asked = parser.parse_args()
+    text = asked.judged.read_text("utf-8")
     lines = [json.loads(line) for line in text.splitlines()]
     lines = [line for line in lines if line["evidence"] is not None]
+    if len({line["scene_id"] for line in lines}) < 2:
+        sys.exit(f"{asked.judged}: needs whole vehicles of two streets or more")
     for name, value in zip(EVIDENCE, fitted(lines).tolist(), strict=True):
         sys.stdout.write(f"{name:14s} {value:8.3f}\n")
     scores, true_db, ious = zip(*held_out(lines), strict=True)

@@ -137,11 +137,12 @@ def judge_run(store: Store, name: str, sheet: Path | None) -> Iterator[Line]:
         )
         truths = [lone.render(camera) for camera in cameras(model.size_m)]
         found = list(judged(model, truths, about["looks"]))
-        kept = {key: record.get(key) for key in ("actor_id", "is_moving", "score", "scene_id")}
+        kept = {key: record.get(key) for key in ("actor_id", "is_moving", "score")}
+        kept |= {"scene_id": run.scene_id, "car": f"{run.scene_id} {record['actor_id']}"}
         known = about.get("evidence", [None] * len(found))
         for (line, _), evidence in zip(found, known, strict=True):
             kept["evidence"] = evidence
-            yield {**kept, "run_id": run.run_id, "car": f"{run.scene_id} {record['name']}", **line}
+            yield {**kept, "run_id": run.run_id, **line}
         if sheet is not None:
             write_png(
                 _pictures(truths, [rgb for _, rgb in found]), sheet / f"{record['actor_id']}.png"

@@ -30,8 +30,9 @@ EVIDENCE = ("one", "seen", "mirrored", "away", "fineness", "hidden", "contrast",
 - `contrast`: decimal logarithm of the variance of its colours: plain ones are easily right;
 - `disagreement`: decimal logarithm of the variance between looks at the same place.
 """
-COEFFICIENTS_DB = (-5.403, 5.081, 0.141, 0.514, 1.644, -1.453, -7.828, -0.398)
-"""In the order of `EVIDENCE`."""
+COEFFICIENTS_DB = (-5.431, 5.087, 0.213, 0.454, 1.555, -1.09, -7.879, -0.499)
+"""In the order of `EVIDENCE`: of 48 vehicles of the streets of seeds 421 to 426 (front camera alone, or
+six), 24 directions each; streets that they were not fitted to are ranked with a Spearman of 0.83."""
 _LEAST_VARIANCE = 1e-4
 
 

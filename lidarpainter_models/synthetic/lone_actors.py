@@ -7,7 +7,6 @@ World: x forward, y left, z up; metres.
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -16,21 +15,15 @@ from torch import Tensor
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.synthetic.raytracing.render import render_image
 from lidarpainter_models.synthetic.raytracing.scene_arrays import (
-    ACTOR,
-    SUN_DIRECTION,
     SUN_RGB,
     InstanceArrays,
     SceneArrays,
     ViewArrays,
 )
-from lidarpainter_models.synthetic.raytracing.trace import RAY, WORK_ROWS, trace_scene
+from lidarpainter_models.synthetic.raytracing.sunlight import is_shaded
 from lidarpainter_models.synthetic.street import SyntheticStreet
 from lidarpainter_models.synthetic.world.packing import lone_scene
 
-SHADE_REACH_M = 120.0
-SHADE_START_M = 0.03
-MOST_OWN_HITS = 6
-"""A ray to the sun leaves the actor's own surfaces after no more of them."""
 FINER = 2
 """An image is traced so many times as fine, one ray for each fine pixel."""
 
@@ -95,7 +88,7 @@ class LoneActor:
         """Whether somebody or something else stands between points (points, 3) and the sun."""
         arrays = self.street.city.arrays
         instances = self.street.instances(self.timestamp_ns)
-        return _shaded(arrays, instances, np.ascontiguousarray(points_world), self.actor_index)
+        return is_shaded(arrays, instances, np.ascontiguousarray(points_world), self.actor_index)
 
 
 def _summed(values: Float[Tensor, "height width channels"]) -> Float[Tensor, "rows columns n"]:
@@ -113,33 +106,3 @@ def _nobody() -> InstanceArrays:
         contact=np.zeros((1, 0, 6)),
         is_lit=np.zeros((1, 64), np.float32),
     )
-
-
-@numba.njit(**{**RAY, "_nrt": True})
-def _shaded(
-    scene: SceneArrays, instances: InstanceArrays, points: np.ndarray, actor: int
-) -> np.ndarray:
-    """Bool (points): the nearest hit towards the sun that is not the actor itself is there."""
-    sun = (
-        scene.light[SUN_DIRECTION],
-        scene.light[SUN_DIRECTION + 1],
-        scene.light[SUN_DIRECTION + 2],
-    )
-    stack = np.full((WORK_ROWS, 2), -1.0)
-    found = np.zeros(points.shape[0], np.bool_)
-    for index in range(points.shape[0]):
-        gone = SHADE_START_M
-        for _ in range(MOST_OWN_HITS):
-            origin = (
-                points[index, 0] + gone * sun[0],
-                points[index, 1] + gone * sun[1],
-                points[index, 2] + gone * sun[2],
-            )
-            hit = trace_scene(scene, instances, 0, origin, sun, (SHADE_REACH_M, 0.004, 0.0), stack)
-            if hit[1] < 0:
-                break
-            if scene.prim_index[hit[1], ACTOR] != actor:
-                found[index] = True
-                break
-            gone += hit[0] + SHADE_START_M
-    return found
