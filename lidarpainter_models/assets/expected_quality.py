@@ -31,8 +31,10 @@ EVIDENCE = ("one", "seen", "mirrored", "away", "fineness", "hidden", "contrast",
 - `disagreement`: decimal logarithm of the variance between looks at the same place.
 """
 COEFFICIENTS_DB = (-5.431, 5.087, 0.213, 0.454, 1.555, -1.09, -7.879, -0.499)
-"""In the order of `EVIDENCE`: of 48 vehicles of the streets of seeds 421 to 426 (front camera alone, or
-six), 24 directions each; streets that they were not fitted to are ranked with a Spearman of 0.83."""
+"""In the order of `EVIDENCE`: of 24 directions of 48 vehicles, of the streets of seeds 421 to 426.
+
+Streets that the numbers were not fitted to are ranked with a Spearman correlation of 0.83.
+"""
 _LEAST_VARIANCE = 1e-4
 
 

@@ -26,7 +26,7 @@ from lidarpainter_models.assets.expected_quality import (
 from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
-from lidarpainter_models.assets.whole_actors import whole_actor
+from lidarpainter_models.assets.whole_actors import LEAST_GAUSSIANS, whole_actor
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -48,8 +48,6 @@ from lidarpainter_models.storage.tensor_files import write_tensors
 
 THUMBNAIL_FILE = "turntable.webp"
 SKY_FILE, WAYPOINTS_FILE = "sky.safetensors", "waypoints.csv"
-LEAST_GAUSSIANS = 20
-"""An actor of fewer is a smear."""
 SKY_ROWS = 96
 """Rows of a sky's picture."""
 NUM_AZIMUTHS = 8

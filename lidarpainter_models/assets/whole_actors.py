@@ -23,6 +23,8 @@ SHAPED = ("car", "van", "pickup", "vehicle")
 """Categories whose shapes are known."""
 SHAPED_LENGTH_M, SHAPED_HEIGHT_M = (3.0, 6.2), (1.2, 2.8)
 """Of boxes whose shapes are known: a data set's `vehicle` may be a bus."""
+LEAST_GAUSSIANS = 20
+"""An actor of fewer is a smear."""
 LEAST_SEEN = 0.02
 """Share of a surface that must have been seen: of less the colours are unknown."""
 BEYOND = 1.1
@@ -38,9 +40,11 @@ def surfaces_of(world: EditedWorld) -> dict[str, SeenSurface]:
         if not is_shaped(track):
             continue
         try:
-            found[track.actor_id] = SeenSurface.of(world.model_of(track))
+            model = world.model_of(track)
         except SceneError:
             continue  # nothing of it was fitted
+        if len(model.gaussians) >= LEAST_GAUSSIANS:
+            found[track.actor_id] = SeenSurface.of(model)
     return found
 
 
