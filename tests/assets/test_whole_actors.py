@@ -1,12 +1,16 @@
 """Vehicles made whole, against shapes and colours that are known."""
 
+import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from gaussian_world import camera_at, map_points, round_gaussians
+from gaussian_world import FRAME_NS, camera_at, map_points, round_gaussians
+from parked_world import clip
 
-from lidarpainter_models.assets.completion import GUESSED, MIRRORED, SEEN, completed
+from lidarpainter_models.assets.asset_files import ABOUT_FILE, ORIGIN_FILE, read_asset
+from lidarpainter_models.assets.completion import GUESSED, MIRRORED, ORIGINS, SEEN, completed
 from lidarpainter_models.assets.expected_quality import (
     COEFFICIENTS_DB,
     EVIDENCE,
@@ -15,12 +19,21 @@ from lidarpainter_models.assets.expected_quality import (
     expected_psnr_db,
     score_of,
 )
+from lidarpainter_models.assets.extraction import write_assets
 from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SeenSurface
+from lidarpainter_models.assets.sighted_actors import RecordedLook, ShownImage, sighted_actors
 from lidarpainter_models.assets.sightings import Look, Sighting
 from lidarpainter_models.assets.vehicle_shapes import BUNDLED, MATERIALS, fitted_shape
-from lidarpainter_models.assets.whole_actors import BEYOND, SIGMAS, kept_in_box, whole_actor
+from lidarpainter_models.assets.whole_actors import (
+    BEYOND,
+    SIGMAS,
+    kept_in_box,
+    surfaces_of,
+    whole_actor,
+)
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.storage.tensor_files import read_tensors
 
 SIZE_M = torch.tensor([4.7, 1.98, 1.45])
 RED = torch.tensor([0.6, 0.1, 0.1])
@@ -158,3 +171,48 @@ def test_a_direction_that_was_seen_is_expected_to_be_better():
 
 def test_the_bundled_shapes_are_small():
     assert BUNDLED.stat().st_size < 1_000_000
+
+
+@pytest.mark.slow
+def test_a_parked_car_is_published_whole_with_its_origins(tmp_path):
+    """Seen from behind; as its fit is red, so is its front, which nobody saw."""
+    source = clip()
+    world = source.world
+    looks = []
+    for frame in range(2):
+        camera = camera_at(0.3 * frame)
+        drawn = world.fitted.render(camera, frame * FRAME_NS)
+        shown = ShownImage(rgb=drawn.rgb.clamp(0, 1), shows_surface=drawn.alpha > 0.5)
+        looks.append(
+            RecordedLook(
+                camera=camera,
+                camera_name="front",
+                timestamp_ns=frame * FRAME_NS,
+                is_seen=True,
+                truth_rgb=None,
+                shown=lambda shown=shown: shown,
+            )
+        )
+    surfaces = surfaces_of(world)
+    sighted_actors(world, looks, lambda _done, _total: None, surfaces)
+    records = write_assets(replace(source, surfaces=surfaces), tmp_path)
+    (car,) = [one for one in records if one["kind"] == "actor"]
+    shares = [car[f"{name}_share"] for name in ORIGINS]
+    assert sum(shares) == pytest.approx(1.0)
+    assert min(shares[SEEN], shares[GUESSED]) > 0.05
+    folder = tmp_path / car["folder"]
+    tensors, _ = read_tensors(folder / ORIGIN_FILE)
+    gaussians = read_asset(folder).gaussians
+    assert len(tensors["origin"]) == car["num_gaussians"] == len(gaussians)
+    assert bool((gaussians.means.abs() <= BEYOND * world.parked[0].size_m / 2).all())
+    about = json.loads((folder / ABOUT_FILE).read_text())
+    assert len(about["expected_psnr_db"]) == len(about["directions_deg"]) == 24
+    assert (
+        about["score"]
+        == car["score"]
+        == pytest.approx(score_of(torch.tensor(about["expected_psnr_db"])), abs=1e-5)
+    )
+    front = gaussians.means[:, 0] > 0.4 * world.parked[0].size_m[0]
+    assert set(tensors["origin"][front].tolist()) <= {MIRRORED, GUESSED}
+    red, green, _ = gaussians.base_rgb[front].median(0).values.tolist()
+    assert red > 1.5 * green
