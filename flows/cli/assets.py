@@ -284,7 +284,7 @@ def _library() -> "tuple[Store, CatalogSql]":
 
 
 def _show_assets(title: str, rows: "list[Row]", note: str) -> None:
-    columns = ("name", "style", "scene_ids", "sides", "coverage", "psnr_db", "score")
+    columns = ("name", "style", "scene_ids", "sides", "coverage", "seen_share", "psnr_db", "score")
     cells = [
         [
             row["asset_id"][:ID_LENGTH],

@@ -54,6 +54,7 @@ HEADINGS = {
     "median_m": "median distance, m",
     "sides": "sides seen",
     "coverage": "directions seen, share",
+    "seen_share": "surface seen, share",
     "score": "score 0 to 1, higher is better",
     "fit_seed": "seed of the fit",
     "cause": "ended as",

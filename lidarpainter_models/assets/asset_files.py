@@ -1,7 +1,8 @@
 """An actor, or a block of street, as a folder of files; Gaussians as every splat viewer reads them.
 
 `gaussians.ply` and `points.safetensors` stand in the box frame (x along the length, y left, z up,
-origin at the centre; metres); `asset.json` holds the rest.
+origin at the centre; metres); `origin.safetensors` says of each Gaussian whether it was seen,
+mirrored or guessed (`completion.ORIGINS`); `asset.json` holds the rest.
 """
 
 import json
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.errors import DataError
@@ -20,13 +23,20 @@ from lidarpainter_models.storage.whole_files import write_whole
 
 GAUSSIANS_FILE = "gaussians.ply"
 POINTS_FILE = "points.safetensors"
+ORIGIN_FILE = "origin.safetensors"
 ABOUT_FILE = "asset.json"
 FRAME = "box frame: x along the length, y left, z up, origin at the centre; metres"
 SIZE_COMMENT = "size_m"
 """Begins the comment of an exported PLY file that says length, width and height."""
 
 
-def write_asset(folder: Path, model: ActorModel, about: Mapping[str, Any]) -> None:
+def write_asset(
+    folder: Path,
+    model: ActorModel,
+    about: Mapping[str, Any],
+    *,
+    origin: Int[Tensor, " gaussians"] | None = None,
+) -> None:
     """Write a model and what is known about it.
 
     Raises:
@@ -36,6 +46,8 @@ def write_asset(folder: Path, model: ActorModel, about: Mapping[str, Any]) -> No
     write_ply(folder / GAUSSIANS_FILE, model.gaussians, (model.category, FRAME))
     if len(model.points):
         write_tensors(folder / POINTS_FILE, model.points.to_arrays(), {})
+    if origin is not None:
+        write_tensors(folder / ORIGIN_FILE, {"origin": origin.to(torch.uint8)}, {})
     road_rgb = None if model.road_rgb is None else model.road_rgb.tolist()
     known = {"category": model.category, "size_m": model.size_m.tolist(), "road_rgb": road_rgb}
     write_whole(folder / ABOUT_FILE, json.dumps({**about, **known}, indent=1).encode())

@@ -7,7 +7,7 @@ neutral exposure: multiplied so that the road where it was recorded is of one gr
 import csv
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.assets.asset_files import write_asset
+from lidarpainter_models.assets.completion import WholeActor
+from lidarpainter_models.assets.expected_quality import (
+    directions,
+    evidence_of,
+    expected_psnr_db,
+    score_of,
+)
+from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
+from lidarpainter_models.assets.whole_actors import LEAST_GAUSSIANS, whole_actor
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -39,8 +48,6 @@ from lidarpainter_models.storage.tensor_files import write_tensors
 
 THUMBNAIL_FILE = "turntable.webp"
 SKY_FILE, WAYPOINTS_FILE = "sky.safetensors", "waypoints.csv"
-LEAST_GAUSSIANS = 20
-"""An actor of fewer is a smear."""
 SKY_ROWS = 96
 """Rows of a sky's picture."""
 NUM_AZIMUTHS = 8
@@ -61,6 +68,8 @@ class AssetSource:
     """Its Gaussians as they are shown, in a style if the run is in one."""
     sighted: Mapping[str, Sighting]
     """How well each actor was seen, by id."""
+    surfaces: Mapping[str, SeenSurface] = field(default_factory=dict)
+    """Surfaces of the vehicles, by id."""
     judged_on: str
     """Which images their errors are of."""
     global_from_world: Float[Tensor, "4 4"]
@@ -107,11 +116,16 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
             continue  # nothing of it was fitted
         if len(found.gaussians) < LEAST_GAUSSIANS:
             continue
-        model = found.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
+        whole = whole_actor(found, source.surfaces.get(track.actor_id))
+        model = whole.model.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
         folder = f"actors/{number:03d}"
-        measured = _measured(seen, source.judged_on)
+        shares = {f"{name}_share": share for name, share in whole.shares.items()}
+        measured = _measured(seen, source.judged_on) | shares
+        expected = _expected(whole, seen)
+        measured["score"] = expected.get("score", seen.score)
         looks = [[one.azimuth_deg, one.elevation_deg, one.distance_m] for one in seen.near_looks]
-        write_asset(output / folder, model, {**measured, "looks": looks})
+        about = {**expected, **measured, "looks": looks}
+        write_asset(output / folder, model, about, origin=whole.origin)
         yield {
             "kind": "actor",
             "category": track.category,
@@ -125,6 +139,20 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
             "thumbnail": _turned(output, folder, model, elevation_deg=15.0),
             "world_from_asset": as_moving(track, source.world.log).world_from_box[0].double(),
         }
+
+
+def _expected(whole: WholeActor, seen: Sighting) -> Record:
+    """Of a vehicle that was made whole, how right it is expected to look; else nothing."""
+    if whole.surface is None:
+        return {}
+    evidence = evidence_of(whole, seen)
+    psnr_db = expected_psnr_db(evidence)
+    return {
+        "score": score_of(psnr_db),
+        "directions_deg": torch.rad2deg(directions()).tolist(),
+        "expected_psnr_db": psnr_db.tolist(),
+        "evidence": evidence.tolist(),
+    }
 
 
 def _measured(seen: Sighting, judged_on: str) -> Record:
@@ -264,12 +292,10 @@ def turntable(
     The azimuth grows to the left: ahead, ahead left, left, ... The camera is so far away that a
     box of this size fits.
     """
-    radius_m = float(size_m.norm()) / 2
-    distance_m = radius_m * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
     pictures = []
     for number in range(NUM_AZIMUTHS):
         azimuth = 2 * math.pi * number / NUM_AZIMUTHS
-        camera = _looking_in(azimuth, math.radians(elevation_deg), distance_m)
+        camera = camera_around(azimuth, math.radians(elevation_deg), size_m)
         bodies = invert_rigid(camera.world_from_camera)[None].float()
         with torch.no_grad():
             image = draw_gaussians(gaussians, bodies, camera)
@@ -277,8 +303,9 @@ def turntable(
     return torch.cat(pictures, dim=1).clamp(0, 1)
 
 
-def _looking_in(azimuth_rad: float, elevation_rad: float, distance_m: float) -> Camera:
-    """A camera on a circle around the origin that looks at it."""
+def camera_around(azimuth_rad: float, elevation_rad: float, size_m: Float[Tensor, "3"]) -> Camera:
+    """A camera that looks at the origin from so far away that a box of this size fits."""
+    distance_m = float(size_m.norm()) / 2 * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
     flat = math.cos(elevation_rad)
     away = torch.tensor(
         [flat * math.cos(azimuth_rad), flat * math.sin(azimuth_rad), math.sin(elevation_rad)],

@@ -1,13 +1,14 @@
 """See every actor of a scene in every view: what `Sighting` collects, for all at once."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.assets.sightings import Sighting, box_view
+from lidarpainter_models.assets.seen_surfaces import SeenSurface
+from lidarpainter_models.assets.sightings import BoxView, Sighting, box_view
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.images import squared_error
@@ -15,6 +16,15 @@ from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 FARTHEST_M = 80.0
 """Who is farther away shows nothing that is worth keeping."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownImage:
+    """What a camera showed, in the colours of the scene itself."""
+
+    rgb: Float[Tensor, "height width 3"]
+    shows_surface: Bool[Tensor, "height width"]
+    """Where that is neither sky nor the recording car."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,17 +39,25 @@ class RecordedLook:
     """Whether the fit saw it: then it tells from where actors were seen."""
     truth_rgb: Callable[[], Float[Tensor, "height width 3"]] | None
     """The image, where the fit is held against it."""
+    shown: Callable[[], ShownImage] | None = None
+    """The image, where it tells how actors look."""
 
 
 def sighted_actors(
-    world: EditedWorld, looks: Sequence[RecordedLook], progress: Callable[[int, int], None]
+    world: EditedWorld,
+    looks: Sequence[RecordedLook],
+    progress: Callable[[int, int], None],
+    surfaces: Mapping[str, SeenSurface] | None = None,
 ) -> dict[str, Sighting]:
-    """What the images of a run show of each of its actors, parked ones too, by id."""
+    """What the images of a run show of each of its actors, parked ones too, by id.
+
+    The surfaces of those that have one, by id, take the colours that the images show of them.
+    """
     tracks = [as_moving(track, world.log) for track in world.tracks]
     poses = TrackPoses.of(tracks)
     found: dict[str, Sighting] = {track.actor_id: Sighting() for track in tracks}
     for done, look in enumerate(looks, start=1):
-        _add(world, look, tracks, poses, found)
+        _add(world, look, tracks, poses, found, surfaces or {})
         progress(done, len(looks))
     return found
 
@@ -50,6 +68,7 @@ def _add(
     tracks: Sequence[ActorTrack],
     poses: TrackPoses,
     found: dict[str, Sighting],
+    surfaces: Mapping[str, SeenSurface],
 ) -> None:
     """Take one view of all who are there."""
     here = poses.all_at(look.timestamp_ns)
@@ -63,15 +82,39 @@ def _add(
     if look.truth_rgb is not None:
         truth = look.truth_rgb()
         maps = (squared_error(rgb, truth), _gradient(rgb), _gradient(truth))
-    for row in rows:
-        seen = box_view(look.camera, depth_m, here[row], tracks[row].size_m)
-        if seen is None:
-            continue
+    views = [box_view(look.camera, depth_m, here[row], tracks[row].size_m) for row in rows]
+    both = [(row, seen) for row, seen in zip(rows, views, strict=True) if seen is not None]
+    for row, seen in both:
         sighting = found[tracks[row].actor_id]
         if look.is_seen:
             sighting.add_look(seen, look.camera.fx_px)
         if maps is not None:
             sighting.add_error(seen, *maps)
+    if look.shown is not None and surfaces:
+        own = [(surfaces.get(tracks[row].actor_id), here[row], seen) for row, seen in both]
+        _add_colours(look, look.shown(), depth_m, own)
+
+
+def _add_colours(
+    look: RecordedLook,
+    shown: ShownImage,
+    depth_m: Float[Tensor, "height width"],
+    seen: Sequence[tuple[SeenSurface | None, Float[Tensor, "4 4"], BoxView]],
+) -> None:
+    """What one image shows of surfaces, the nearest first: where its box is, the others are not."""
+    is_free = shown.shows_surface.clone()
+    for surface, world_from_box, view in sorted(
+        seen, key=lambda one: float(one[2].camera_box.norm())
+    ):
+        if surface is not None:
+            surface.add_look(
+                look.camera,
+                world_from_box,
+                rgb=shown.rgb,
+                depth_m=depth_m,
+                shows_surface=is_free,
+            )
+        is_free[view.row, view.column] = False
 
 
 def _may_be_seen(

@@ -113,6 +113,12 @@ function stage(asset, parent) {
   made.onpointerup = () => { from = null; };
   return made;
 }
+const ORIGINS = ["seen", "mirrored", "guessed"];
+function origins(asset) {  // where its Gaussians come from, if not all were seen
+  const parts = ORIGINS.filter(name => asset[`${name}_share`] > 0.005);
+  if (!parts.length || parts.join() === "seen") return "";
+  return parts.map(name => `${Math.round(100 * asset[`${name}_share`])} % ${name}`).join(", ");
+}
 function card(asset) {
   const made = make("div", "card");
   Object.assign(made, { tabIndex: 0, role: "button" });
@@ -127,7 +133,7 @@ function card(asset) {
     if (asset.sides.includes("top")) sides.style.background = "color-mix(in srgb, var(--accent) 45%, transparent)";
     sides.title = "seen from " + asset.sides.join(", ");
   }
-  make("span", "soft", extent(asset) || asset.category, said);
+  make("span", "soft", [extent(asset) || asset.category, origins(asset)].filter(Boolean).join(" · "), said);
   made.onclick = () => { if (!made.stage.dragged) open(asset); made.stage.dragged = false; };
   made.onkeydown = event => { if (event.key === "Enter") open(asset); };
   return made;
@@ -142,7 +148,7 @@ function open(asset) {
   stage(asset, both);
   const table = make("table", "", null, both);
   const facts = { id: asset.asset_id, kind: asset.kind, category: asset.category, size: extent(asset), style: asset.style,
-    "seen from": asset.sides?.join(", "), "directions seen": number(asset.coverage, 2), score: number(asset.score, 2),
+    "seen from": asset.sides?.join(", "), "directions seen": number(asset.coverage, 2), "of its surface": origins(asset), score: number(asset.score, 2),
     PSNR: number(asset.psnr_db, 1, " dB"), LPIPS: number(asset.lpips, 3), images: asset.num_views,
     Gaussians: asset.num_gaussians?.toLocaleString("en"), "LiDAR points": asset.num_points?.toLocaleString("en"),
     sightings: asset.num_sightings, scenes: asset.scene_ids?.join(", "), dataset: asset.dataset, licence: asset.licence };

@@ -18,6 +18,7 @@ from lidarpainter_models.storage.whole_files import storage_errors
 FIELDS = (
     *("asset_id", "kind", "category", "name", "dataset", "licence", "style", "actor_id", "run_id"),
     *("scene_ids", "length_m", "width_m", "height_m", "sides", "coverage", "score"),
+    *("seen_share", "mirrored_share", "guessed_share"),
     *("psnr_db", "lpips", "num_views", "num_points", "num_gaussians", "num_sightings"),
 )
 """What the page knows of an asset; it may lack any but `asset_id` and `kind`."""

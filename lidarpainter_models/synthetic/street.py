@@ -89,6 +89,11 @@ class SyntheticStreet:
         return tuple(START_NS + index * step_ns for index in range(self.config.num_frames))
 
     @property
+    def city(self) -> City:
+        """All that was drawn."""
+        return self._city
+
+    @property
     def num_actors(self) -> int:
         """How many boxed things there are."""
         return len(self._city.actors)
@@ -244,6 +249,10 @@ class SyntheticStreet:
             semantics=torch.from_numpy(label[..., 0][is_kept]),
             actor_index=torch.from_numpy(label[..., 1][is_kept]),
         )
+
+    def instances(self, timestamp_ns: int) -> InstanceArrays:
+        """Where everything that moves is at one time, and which lamps are on."""
+        return self._instances(_seconds(timestamp_ns))
 
     def _instances(self, time_s: np.ndarray) -> InstanceArrays:
         """Where everything that moves is at given times, and which lamps are on."""

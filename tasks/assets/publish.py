@@ -12,8 +12,10 @@ from torch import Tensor
 
 from catalog.artefacts import Workplace
 from lidarpainter_models.assets.extraction import AssetSource, write_assets
-from lidarpainter_models.assets.sighted_actors import RecordedLook, sighted_actors
+from lidarpainter_models.assets.sighted_actors import RecordedLook, ShownImage, sighted_actors
+from lidarpainter_models.assets.whole_actors import surfaces_of
 from lidarpainter_models.editing.worlds import EditedWorld
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
@@ -58,12 +60,16 @@ def _build(
 ) -> dict[str, Any]:
     world = opened_world(this.store, finished)
     final = load_scene(this.store, finished.final.gaussians)
-    looks = _looks(this, world, observation, is_judged=final.style is None)
-    sighted = sighted_actors(world, looks, lambda done, total: progress(done, total, "seen"))
+    looks = _looks(this, world, observation, final)
+    surfaces = surfaces_of(world)
+    sighted = sighted_actors(
+        world, looks, lambda done, total: progress(done, total, "seen"), surfaces
+    )
     middle_ns = (world.log.start_ns + world.log.end_ns) // 2
     source = AssetSource(
         world=replace(world, scene=final.baked(middle_ns)),
         sighted=sighted,
+        surfaces=surfaces,
         judged_on="held-out" if this.views.test else "training",
         global_from_world=this.scene.global_from_world,
     )
@@ -73,13 +79,13 @@ def _build(
 
 
 def _looks(
-    this: OpenedRun, world: EditedWorld, observation: ObservationConfig, *, is_judged: bool
+    this: OpenedRun, world: EditedWorld, observation: ObservationConfig, final: GaussianScene
 ) -> list[RecordedLook]:
     """The images that the fit saw, and those held out; errors are of the latter if there are any.
 
-    A style has no truth: its scene is not judged.
+    A style has no truth: its scene is not judged, and what it shows is rendered.
     """
-    scene = world.fitted
+    scene, is_judged = world.fitted, final.style is None
     looks = [
         RecordedLook(
             camera=scene.refined_camera(view),
@@ -87,6 +93,7 @@ def _looks(
             timestamp_ns=view.timestamp_ns,
             is_seen=True,
             truth_rgb=partial(_seen, view) if is_judged and not this.views.test else None,
+            shown=partial(_shown, final, view),
         )
         for view in world.views
     ]
@@ -102,6 +109,15 @@ def _looks(
             )
         )
     return looks
+
+
+def _shown(final: GaussianScene, view: TrainingView) -> ShownImage:
+    """A recorded image in the colours of the scene, or what a style makes of it."""
+    if final.style is None:
+        rgb = final.exposure.undone(view.rgb, view.key[1], view.timestamp_ns)
+    else:
+        rgb = final.render(final.refined_camera(view), view.timestamp_ns).rgb.cpu()
+    return ShownImage(rgb=rgb.clamp(0, 1), shows_surface=view.shows_surface)
 
 
 def _seen(view: TrainingView) -> Tensor:

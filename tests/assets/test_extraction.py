@@ -9,7 +9,7 @@ import torch
 from gaussian_world import round_gaussians
 from parked_world import PARKED, RED, SIZE_M, clip
 
-from lidarpainter_models.assets.asset_files import ABOUT_FILE, read_asset
+from lidarpainter_models.assets.asset_files import ABOUT_FILE, ORIGIN_FILE, read_asset
 from lidarpainter_models.assets.extraction import (
     HEIGHT_PX,
     NUM_AZIMUTHS,
@@ -24,6 +24,7 @@ from lidarpainter_models.errors import DataError
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.storage.tensor_files import read_tensors
 
 
 @pytest.fixture(scope="module")
@@ -134,3 +135,6 @@ def test_what_is_known_stands_beside_the_files(written):
     about = json.loads((folder / car["folder"] / ABOUT_FILE).read_text())
     assert about["sides"] == car["sides"]
     assert len(about["looks"]) == car["num_views"] == 4
+    tensors, _ = read_tensors(folder / car["folder"] / ORIGIN_FILE)
+    assert tensors["origin"].tolist() == [0] * car["num_gaussians"]  # no surface: seen, all of it
+    assert (car["seen_share"], car["mirrored_share"], car["guessed_share"]) == (1.0, 0.0, 0.0)

@@ -80,6 +80,19 @@ def pack_scene(
     return arrays, np.array(roots[1:], np.int32), np.array(radii, np.float64)
 
 
+def lone_scene(whole: layout.SceneArrays, mesh: Mesh) -> layout.SceneArrays:
+    """A scene in the light of another one, of nothing but a mesh of its surfaces; actor 0."""
+    owner = np.zeros(len(mesh.surface), np.int64)
+    bounds, children, geometry, shading, index = _pack_tree(mesh, owner, whole.surface_index, 0, 0)
+    return whole._replace(
+        node_bounds=bounds,
+        node_children=children,
+        prim_geometry=geometry,
+        prim_shading=shading,
+        prim_index=index,
+    )
+
+
 def _pack_tree(
     mesh: Mesh, actor: np.ndarray, surface_index: np.ndarray, num_nodes: int, num_prims: int
 ) -> tuple[np.ndarray, ...]:
