@@ -60,9 +60,9 @@ class GuidanceConfig:
     perceptual: float = 0.0
     """Weight of the perceptual distance in a painted view's loss, where one is given to the fit
     (1 in the paper)."""
-    depth: float = 0.01
-    """Weight of the LiDAR depth term on painted views: a painted guess in a hole would otherwise
-    pull surfaces off their LiDAR depth."""
+    depth: float = 0.05
+    """Weight of the LiDAR depth term on painted views, that of recorded ones: a painted guess in a
+    hole would otherwise pull surfaces off their LiDAR depth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
