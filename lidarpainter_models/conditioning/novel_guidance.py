@@ -40,7 +40,7 @@ from lidarpainter_models.scenes.records import ViewKey
 
 ROOM_M = 0.6  # no surface may be nearer to a moved camera than this
 MAX_POINTS_IN_ROOM = 10  # LiDAR points nearer than that which still count as noise
-LEAST_WEIGHT = 0.05
+LEAST_WEIGHT = 0.1
 """What a painted pixel counts at the least. Where nothing vouches for a painting it is still nearer
 to what is there than the holes and smears that no recorded view corrects
 (docs/decisions/what-guides-a-fit.md)."""

@@ -52,17 +52,18 @@ class GuidanceConfig:
     """Probability of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the
     neighbouring lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1
     (docs/decisions/what-guides-a-fit.md)."""
-    weight: float = 2.0
-    """Weight of a painted view's loss (the paper's lambda_novel is 0.2 for pixels that all count
-    fully; here most count a twentieth)."""
+    weight: float = 1.0
+    """Weight of a painted view's loss (the paper's lambda_novel is 0.2, for pixels that all count
+    fully; here most count a tenth)."""
     ssim: float = 0.1
     """Weight of 1 - SSIM in a painted view's loss, as in the paper."""
     perceptual: float = 0.0
     """Weight of the perceptual distance in a painted view's loss, where one is given to the fit
     (1 in the paper)."""
-    depth: float = 0.05
-    """Weight of the LiDAR depth term on painted views, that of recorded ones: a painted guess in a
-    hole would otherwise pull surfaces off their LiDAR depth."""
+    depth: float = 0.02
+    """Weight of the LiDAR depth term on painted views: a painted guess in a hole would otherwise
+    pull surfaces off their LiDAR depth. More costs recorded views where images and LiDAR disagree
+    (docs/decisions/what-guides-a-fit.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
