@@ -71,7 +71,7 @@ def paper(scene: str) -> ReconstructParameters:
     with `fit.losses.perceptual=1`, `refine.losses.perceptual=1` and `refine.guidance.perceptual=1`.
     """
     fit = FitConfig(effort=EffortConfig(looks=3_500.0), half_resolution=0.0)
-    guidance = GuidanceConfig(probability=0.4, until=1.0, weight=0.2, ssim=0.1)
+    guidance = GuidanceConfig(probability=0.4, weight=0.2, ssim=0.1)
     changes = {
         "preset": "paper",
         "observation": ObservationConfig(width_px=1024),

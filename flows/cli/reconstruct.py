@@ -193,7 +193,8 @@ def shifted(
 
     sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
     upwards = [Shift(up_m=metres) for metres in _distances(up)]
-    return {"novel": replace(novel, shifts=(*sideways, *upwards))}
+    turned = [one for one in novel.shifts if one.yaw_rad]
+    return {"novel": replace(novel, shifts=(*sideways, *upwards, *turned))}
 
 
 def of_fits(

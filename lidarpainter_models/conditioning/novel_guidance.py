@@ -2,9 +2,10 @@
 
 The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
 painted, and every pixel gets a weight: painter confidence times geometric confidence times the
-gate of `confidence`, where the painting departs from the render. Views from inside a car or a wall
-are left out; refused paintings stay in the result, for the report, but give no guidance. World: x
-forward, y left, z up; metres.
+gate of `confidence`, where the painting departs from the render; a little everywhere. Views from inside a car or a wall
+are left out, and those that are turned towards where another camera of the rig looks; refused
+paintings stay in the result, for the report, but give no guidance. World: x forward, y left, z up;
+metres.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -39,6 +40,12 @@ from lidarpainter_models.scenes.records import ViewKey
 
 ROOM_M = 0.6  # no surface may be nearer to a moved camera than this
 MAX_POINTS_IN_ROOM = 10  # LiDAR points nearer than that which still count as noise
+LEAST_WEIGHT = 0.1
+"""What a painted pixel counts at the least. Where nothing vouches for a painting it is still nearer
+to what is there than the holes and smears that no recorded view corrects
+(docs/decisions/what-guides-a-fit.md)."""
+AXIS_M = 30.0
+"""How far ahead of a turned camera lies what it looks at."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,7 +93,8 @@ def novel_cameras(
 
     `frame_indices` are those of `world_from_ego`, in order of time. Training frames are counted
     from `start`, so that another round may paint other frames. Of a car that stands an image each
-    half second counts (`views_showing_more`).
+    half second counts (`views_showing_more`). A camera is turned only to where no other camera of
+    its frame looks.
 
     Raises:
         ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
@@ -100,7 +108,7 @@ def novel_cameras(
     training_views = views_showing_more(training_views)
     frames = sorted({view.key[0] for view in training_views})
     chosen = set(frames[start % config.every_nth :: config.every_nth])
-    return [
+    moved = [
         NovelCamera(
             camera=view.camera.at(
                 shift_pose(view.camera.world_from_camera, directions[view.key[0]], shift)
@@ -114,6 +122,19 @@ def novel_cameras(
         if view.key[0] in chosen
         and (config.camera_names is None or view.key[1] in config.camera_names)
     ]
+    of_frame: dict[int, list[Camera]] = {}
+    for view in training_views:
+        of_frame.setdefault(view.key[0], []).append(view.camera)
+    return [one for one in moved if not _looks_where_one_does(one, of_frame[one.key[0]])]
+
+
+def _looks_where_one_does(novel: NovelCamera, cameras: Sequence[Camera]) -> bool:
+    """Whether a camera that was turned in its place looks at what one of these shows."""
+    if not novel.shift.yaw_rad:
+        return False
+    pose = novel.camera.world_from_camera
+    ahead = (pose[:3, 3] + AXIS_M * pose[:3, 2])[None]
+    return any(bool(camera.contains(*camera.project(ahead))) for camera in cameras)
 
 
 def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -> None:
@@ -200,12 +221,14 @@ def _paint(
     conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
     gate = guidance_gate(painting, conditions)
     geometric = view_support(conditions, novel.camera, builder.recorded_cameras)
+    is_refused = bool((gate == 0).all())
+    least = 0.0 if is_refused else LEAST_WEIGHT
     trust = (painting.confidence * geometric * gate).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,
         novel.timestamp_ns,
         rgb=painting.rgb,
-        weight=trust * departure_weight(painting, conditions),
+        weight=least + (1 - least) * trust * departure_weight(painting, conditions),
         lidar_depth_m=conditions.lidar_depth_m,
     )
     home = torch.device("cpu")  # where paintings of a whole log have room
@@ -214,7 +237,7 @@ def _paint(
     return NovelPainting(
         novel=novel,
         guidance=guidance.to(home),
-        is_refused=bool((gate.to(home) == 0).all()),
+        is_refused=is_refused,
         images=images,
     )
 

@@ -1,7 +1,7 @@
 """What decides which views are painted and what a painter is shown; read without tensors."""
 
 from dataclasses import dataclass, field, replace
-from math import copysign
+from math import copysign, radians
 from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
@@ -43,6 +43,8 @@ DEFAULT_SHIFTS = (
     Shift(lateral_m=3.0),
     Shift(lateral_m=-3.0),
     Shift(up_m=1.5),
+    Shift(yaw_rad=radians(40)),
+    Shift(yaw_rad=-radians(40)),
 )
 
 
@@ -51,7 +53,9 @@ class NovelGuidanceConfig:
     """Which views are painted and what becomes of them."""
 
     shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
-    """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
+    """Where the recorded cameras are moved to: the paper's 2 and 3 m to both sides and 1.5 m up, and
+    in their place turned by 40 degrees to both sides where no camera of the rig looks
+    (docs/decisions/what-guides-a-fit.md)."""
     outwards_m: float = 0.0
     """How much farther to the side each round paints than the one before; with 0 rounds share the
     distances to the side among them."""

@@ -44,5 +44,6 @@ class Shift:
         if self.up_m:
             parts.append(f"{'up' if self.up_m > 0 else 'down'}-{abs(self.up_m):g}m")
         if self.yaw_rad:
-            parts.append(f"yaw-{self.yaw_rad:g}rad")
+            side = "left" if self.yaw_rad > 0 else "right"
+            parts.append(f"turned-{side}-{abs(math.degrees(self.yaw_rad)):.3g}deg")
         return "+".join(parts) or "recorded"

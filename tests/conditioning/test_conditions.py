@@ -135,11 +135,22 @@ def test_rounds_share_the_distances_to_the_side():
         return [shift.name for shift in config.in_round(number, rounds).shifts]
 
     assert config.in_round(1, 1) == config
-    assert painted(1, 2) == ["left-2m", "right-2m", "up-1.5m"]
-    assert painted(2, 2) == ["left-3m", "right-3m", "up-1.5m"]
+    always = ["up-1.5m", "turned-left-40deg", "turned-right-40deg"]
+    assert painted(1, 2) == ["left-2m", "right-2m", *always]
+    assert painted(2, 2) == ["left-3m", "right-3m", *always]
     assert painted(3, 3) == painted(1, 3) == painted(1, 2)
     up = NovelGuidanceConfig(shifts=(Shift(up_m=1.5),))
     assert up.in_round(2, 2) == up
+
+
+def test_cameras_turn_to_where_no_camera_of_the_rig_looks(views):
+    config = NovelGuidanceConfig(shifts=(Shift(yaw_rad=0.7), Shift(yaw_rad=-0.7)), every_nth=5)
+    alone = novel_cameras(views, range(10), ego_path(), config=config)
+    assert [camera.shift for camera in alone] == list(config.shifts)
+    left = replace(views[0], key=(0, "front_left"), camera=alone[0].camera)
+    both = novel_cameras([*views, left], range(10), ego_path(), config=config)
+    turned = {(camera.key[1], camera.shift.yaw_rad) for camera in both}
+    assert turned == {("front", -0.7), ("front_left", 0.7)}
 
 
 def test_a_standing_car_still_has_a_left_side(views):

@@ -117,7 +117,7 @@ def test_a_round_that_makes_views_worse_is_to_be_taken_back(store, parameters, s
     run, painted = parameters.run_spec(store.root), stages["paint-1"].ref
     first = FittedRef(stages["prepare"].ref, stages["fit"].ref)
     monkeypatch.setattr("tasks.reconstruction.paint.read_tensors", negatives)
-    guidance = replace(parameters.refine.guidance, probability=1.0, until=1.0, weight=20.0)
+    guidance = replace(parameters.refine.guidance, probability=1.0, weight=20.0)
     config = replace(parameters.refine, steps=60, guidance=guidance)
     spoilt = refine.fn(run, "refine-1", first, config, guidance=painted)
     gain = spoilt.summary["gain"]

@@ -52,20 +52,18 @@ class GuidanceConfig:
     """Probability of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the
     neighbouring lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1
     (docs/decisions/what-guides-a-fit.md)."""
-    until: float = 0.7
-    """Part of the steps that painted views take part in. The last ones fit recorded views alone,
-    which halves what painting costs these (docs/decisions/what-guides-a-fit.md)."""
     weight: float = 1.0
-    """Weight of a painted view's loss (the paper's lambda_novel, 0.2, changed nothing on short
-    schedules)."""
+    """Weight of a painted view's loss (the paper's lambda_novel is 0.2, for pixels that all count
+    fully; here most count a tenth)."""
     ssim: float = 0.1
     """Weight of 1 - SSIM in a painted view's loss, as in the paper."""
     perceptual: float = 0.0
     """Weight of the perceptual distance in a painted view's loss, where one is given to the fit
     (1 in the paper)."""
-    depth: float = 0.01
+    depth: float = 0.02
     """Weight of the LiDAR depth term on painted views: a painted guess in a hole would otherwise
-    pull surfaces off their LiDAR depth."""
+    pull surfaces off their LiDAR depth. More costs recorded views where images and LiDAR disagree
+    (docs/decisions/what-guides-a-fit.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,9 +169,8 @@ class FitConfig:
                 raise ConfigError(f"{name} must be positive, got {value}")
         if not 0 <= self.half_resolution <= 1:
             raise ConfigError(f"half_resolution must be in [0, 1], got {self.half_resolution}")
-        for name in ("probability", "until"):
-            if not 0 <= (value := getattr(self.guidance, name)) <= 1:
-                raise ConfigError(f"guidance.{name} must be in [0, 1], got {value}")
+        if not 0 <= (value := self.guidance.probability) <= 1:
+            raise ConfigError(f"guidance.probability must be in [0, 1], got {value}")
 
 
 def continuation(

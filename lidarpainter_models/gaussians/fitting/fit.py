@@ -253,8 +253,7 @@ def _advance(
 ) -> None:
     """Make one step: gradients, optimisers, and at their times what changes the set."""
     painted, config = None, state.config
-    takes_part = state.step < config.guidance.until * state.steps
-    if guidance and takes_part and state.random() < config.guidance.probability:
+    if guidance and state.random() < config.guidance.probability:
         place = int(torch.randint(len(guidance), (), generator=state.generator))
         painted = (place, guidance[place].to(state.scene.device))
     image = images[row].to(state.scene.device)

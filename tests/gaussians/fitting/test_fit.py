@@ -256,21 +256,6 @@ def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread
     assert_same_scene(*(found.scene for found in fitted))
 
 
-def test_the_last_steps_fit_recorded_views_alone(world):
-    def fitted(until):
-        guidance = GuidanceConfig(until=until, weight=3.0)
-        config = replace(continuation(short_fit(), guidance=guidance), steps=20)
-        views = [painted_view(world)]
-        return fit_gaussians(world.observations, config, start=world.scene, guidance=views).scene
-
-    unguided = replace(continuation(short_fit()), steps=20)
-    alone = fit_gaussians(world.observations, unguided, start=world.scene).scene
-    assert_same_scene(fitted(0.0), alone)
-    some, all_along = fitted(0.5).gaussians.means, fitted(1.0).gaussians.means
-    assert not torch.equal(some, alone.gaussians.means)
-    assert not torch.equal(some, all_along)
-
-
 def test_untrusted_painted_view_changes_nothing(world):
     config = short_fit(guidance=GuidanceConfig(depth=0.0))
     _, seen = with_guidance_gradients(world, painted_view(world, weight=0.0), config)
