@@ -6,7 +6,11 @@ Every number of a run stands here or in the library's defaults.
 from collections.abc import Callable
 
 from flows.parameters import ReconstructParameters
-from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
+from lidarpainter_models.conditioning.settings import (
+    PAPER_SHIFTS,
+    ConditionConfig,
+    NovelGuidanceConfig,
+)
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.settings import ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import (
@@ -18,7 +22,7 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.observations.settings import ObservationConfig
 
 SHORT_REFINE_LOOKS = 150.0
-"""A round of the CPU preset: on one front camera ten looks at each of 21 painted views."""
+"""A round of the CPU preset: on one front camera six looks at each of 35 painted views."""
 
 
 def preview(scene: str) -> ReconstructParameters:
@@ -67,6 +71,9 @@ def balanced(scene: str) -> ReconstructParameters:
 def paper(scene: str) -> ReconstructParameters:
     """The paper's schedule: 7 parts recorded views alone, 23 with novel ones, 1024 pixels wide.
 
+    Cameras are moved as the paper moves them and none is turned; pixels are weighed as in the other
+    presets, by trust.
+
     Its LPIPS counts where weights are given: `--set lpips.backbone=FILE --set lpips.heads=FILE`
     with `fit.losses.perceptual=1`, `refine.losses.perceptual=1` and `refine.guidance.perceptual=1`.
     """
@@ -76,7 +83,7 @@ def paper(scene: str) -> ReconstructParameters:
         "preset": "paper",
         "observation": ObservationConfig(width_px=1024),
         "fit": fit,
-        "novel": NovelGuidanceConfig(every_nth=1),
+        "novel": NovelGuidanceConfig(every_nth=1, shifts=PAPER_SHIFTS),
         "rounds": 1,
         "refine": continuation(fit, looks=11_500.0, guidance=guidance),
     }

@@ -59,7 +59,9 @@ def reference_seconds(
 
     has_truth = parameters.scene.startswith("synthetic/")  # views beside the path are drawn too
     paints = any(name.startswith("paint-") for name in parameters.stages)
-    of_round = len(parameters.novel.shifts) / max(parameters.rounds, 1) + 0.5
+    shifts = parameters.novel.in_round(1, max(parameters.rounds, 1)).shifts
+    turns = len(parameters.train_cameras or ()) == 1  # else most turned views are another camera's
+    of_round = sum(turns or bool(shift.lateral_m or shift.up_m) for shift in shifts)
     painted = ceil(train / parameters.novel.every_nth) * of_round
     step_s = 0.005 + 2.6e-7 * pixels
     truths_s = 1.0 + 5e-6 * pixels if has_truth else 0.0

@@ -32,7 +32,7 @@ WORDS = """
 preset: How much effort is made: brief (a minute or two), preview (minutes on a CPU), balanced (the
   best trade), or paper (the effort of the paper); preview if absent.
 shift: Metres to both sides of the path at which views are painted, such as 2,3; at most 8. The
-  preset's if absent.
+  preset's if absent. Views that are turned on the path are painted as well, as the preset has it.
 up: Metres above the path at which views are painted, such as 1.5; at most 8. The preset's if
   absent.
 rounds: Number of rounds, each one painting and the continued fit after it; 0 paints nothing. The
@@ -193,7 +193,7 @@ def shifted(
 
     sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
     upwards = [Shift(up_m=metres) for metres in _distances(up)]
-    turned = [one for one in novel.shifts if one.yaw_rad]
+    turned = [one for one in novel.shifts if not (one.lateral_m or one.up_m)]
     return {"novel": replace(novel, shifts=(*sideways, *upwards, *turned))}
 
 

@@ -1,11 +1,11 @@
 """Painted images of views that nobody recorded, to guide the fit on.
 
-The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
-painted, and every pixel gets a weight: painter confidence times geometric confidence times the
-gate of `confidence`, where the painting departs from the render; a little everywhere. Views from inside a car or a wall
-are left out, and those that are turned towards where another camera of the rig looks; refused
-paintings stay in the result, for the report, but give no guidance. World: x forward, y left, z up;
-metres.
+The recorded cameras are moved sideways and up relative to the road, or turned, what the scene
+shows there is painted, and every pixel gets a weight: painter confidence times geometric
+confidence times the gate of `confidence`, where the painting departs from the render, and a little
+everywhere. Views from inside a car or a wall are left out, and those that are turned towards where
+another camera of the rig looks; refused paintings stay in the result, for the report, but give no
+guidance. World: x forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Iterator, Sequence

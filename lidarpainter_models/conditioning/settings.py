@@ -37,15 +37,14 @@ class SequenceConfig:
     warped images, of which it was trained to expect recorded ones only."""
 
 
-DEFAULT_SHIFTS = (
+PAPER_SHIFTS = (
     Shift(lateral_m=2.0),
     Shift(lateral_m=-2.0),
     Shift(lateral_m=3.0),
     Shift(lateral_m=-3.0),
     Shift(up_m=1.5),
-    Shift(yaw_rad=radians(40)),
-    Shift(yaw_rad=-radians(40)),
 )
+DEFAULT_SHIFTS = (*PAPER_SHIFTS, Shift(yaw_rad=radians(40)), Shift(yaw_rad=-radians(40)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,8 +52,8 @@ class NovelGuidanceConfig:
     """Which views are painted and what becomes of them."""
 
     shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
-    """Where the recorded cameras are moved to: the paper's 2 and 3 m to both sides and 1.5 m up, and
-    in their place turned by 40 degrees to both sides where no camera of the rig looks
+    """Where the recorded cameras are moved to: the paper's 2 and 3 m to both sides and 1.5 m up;
+    where no camera of the rig looks they are turned by 40 degrees to both sides as well
     (docs/decisions/what-guides-a-fit.md)."""
     outwards_m: float = 0.0
     """How much farther to the side each round paints than the one before; with 0 rounds share the
@@ -80,9 +79,9 @@ class NovelGuidanceConfig:
     def in_round(self, number: int, rounds: int) -> "NovelGuidanceConfig":
         """What is painted in one of so many rounds, of which the first is 1.
 
-        Each distance to the side is painted in one of them, the nearest first: all of them in each
-        took longer and gave nothing more (docs/decisions/what-guides-a-fit.md). What is not aside
-        is painted in all.
+        Each distance to the side is painted in one of them, the nearest first: to paint all of them
+        in each round took two thirds more time and gave nothing. What is not aside is painted in
+        all rounds.
 
         Raises:
             ConfigError: that is farther away than a scene shows anything.

@@ -85,8 +85,8 @@ def painted_loss(
         shown, view.rgb, ssim_weight=settings.ssim, pixel_weight=view.weight
     )
     if perceptual is not None and settings.perceptual > 0:
-        trusted = torch.where(view.weight[..., None] > 0, shown, view.rgb)
-        distance = view.weight.mean() * perceptual(trusted, view.rgb)
+        trusted = view.rgb + view.weight[..., None] * (shown - view.rgb)
+        distance = perceptual(trusted, view.rgb)
         loss = loss + settings.weight * settings.perceptual * distance
     if settings.depth > 0:
         loss = loss + settings.depth * depth_loss(
