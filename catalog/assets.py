@@ -109,9 +109,14 @@ def sightings_of(store: Store, asset_id: str) -> list[Row]:
     return sorted(_stored(store, "asset_id", [asset_id]), key=how_well, reverse=True)
 
 
-def how_well(sighting: Row) -> tuple[float, str]:
-    """Sorts sightings by how well they serve, the best last."""
-    return sighting["score"] or 0.0, sighting["sighting_id"]
+def how_well(sighting: Row) -> tuple[bool, float, str]:
+    """Sorts sightings by how well they serve, the best last.
+
+    What was published before vehicles were made whole has no `seen_share`, a score of another
+    kind, and serves last.
+    """
+    is_whole = sighting.get("seen_share") is not None
+    return is_whole, sighting["score"] or 0.0, sighting["sighting_id"]
 
 
 class _Groups:

@@ -12,10 +12,10 @@ import json
 import sys
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import torch
 from jaxtyping import Float
+from judge_assets import GOOD_IOU, GOOD_SCORE, Line
 from scipy.stats import spearmanr
 from torch import Tensor
 
@@ -23,8 +23,6 @@ from lidarpainter_models.assets.expected_quality import EVIDENCE, score_of
 
 RIDGE = 20.0
 """Directions that say as much as the assumption that evidence beside the first tells nothing."""
-GOOD_IOU, GOOD_SCORE = 0.8, 0.7
-Line = dict[str, Any]
 
 
 def fitted(lines: list[Line]) -> Float[Tensor, " evidence"]:
@@ -41,7 +39,10 @@ def fitted(lines: list[Line]) -> Float[Tensor, " evidence"]:
 
 def by_car(lines: list[Line]) -> dict[str, list[Line]]:
     """The directions of each vehicle."""
-    return {car: [one for one in lines if one["car"] == car] for car in {x["car"] for x in lines}}
+    found: dict[str, list[Line]] = {}
+    for line in lines:
+        found.setdefault(line["car"], []).append(line)
+    return found
 
 
 def held_out(lines: list[Line]) -> list[tuple[float, float, float]]:

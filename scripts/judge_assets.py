@@ -145,7 +145,8 @@ def judge_run(store: Store, name: str, sheet: Path | None) -> Iterator[Line]:
             yield {**kept, "run_id": run.run_id, **line}
         if sheet is not None:
             write_png(
-                _pictures(truths, [rgb for _, rgb in found]), sheet / f"{record['actor_id']}.png"
+                _pictures(truths, [rgb for _, rgb in found]),
+                sheet / run.run_id / f"{record['actor_id']}.png",
             )
 
 

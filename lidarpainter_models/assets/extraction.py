@@ -117,6 +117,8 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
         if len(found.gaussians) < LEAST_GAUSSIANS:
             continue
         whole = whole_actor(found, source.surfaces.get(track.actor_id))
+        if len(whole.model.gaussians) < LEAST_GAUSSIANS:
+            continue  # what was fitted lies outside its box
         model = whole.model.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
         folder = f"actors/{number:03d}"
         shares = {f"{name}_share": share for name, share in whole.shares.items()}

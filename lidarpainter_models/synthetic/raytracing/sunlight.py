@@ -1,4 +1,4 @@
-"""Which places the sun does not reach, for whom one actor casts no shadow."""
+"""Which places the sun does not reach, if shadows of one given actor are left out."""
 
 import numba
 import numpy as np
