@@ -63,6 +63,13 @@ def test_one_car_in_two_runs_is_one_asset_and_the_better_sighting_serves(store):
     assert assets[1]["actor_id"] == "b"
 
 
+def test_what_was_published_before_vehicles_were_whole_serves_last(store):
+    old = sighting("a", score=0.9)
+    new = sighting("a", run="new", score=0.4, seen_share=0.5)
+    (asset,) = entered(store, [new], [old])["assets"]
+    assert (asset["run_id"], asset["score"]) == ("new", 0.4)
+
+
 def test_only_what_may_be_the_same_is_compared(store):
     unique = "e0b1a2c4-9f6d-4f7e"
     elsewhere = [
