@@ -105,6 +105,13 @@ class ActorModel:
             road_rgb=self.road_rgb * gain,
         )
 
+    def with_points_all_round(self) -> "ActorModel":
+        """The same with points on all opaque Gaussians in place of those that LiDAR measured.
+
+        LiDAR saw one side: through the others a painter would be shown the street behind.
+        """
+        return replace(self, points=sampled_points(self.gaussians))
+
     def of_degree(self, sh_degree: int) -> "ActorModel":
         """The same with harmonics of another degree."""
         return replace(self, gaussians=of_degree(self.gaussians, sh_degree))

@@ -1,6 +1,6 @@
 """Where the actors of an edit come from: other runs, the library of assets, files."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
@@ -88,7 +88,7 @@ def model_of(store: Store, source: ActorSource) -> ActorModel:
         world = opened_world(store, donor)
         return world.model_of(world.find(str(source.actor)))
     if isinstance(donor, LibraryActor):
-        return read_asset(donor.path)
+        return read_asset(donor.path).with_points_all_round()
     if donor is None:
         raise ConfigError("the edited run's own actors are found in its world, not in another")
     return ActorModel.of_gaussians(read_ply(donor), CATEGORY)

@@ -85,4 +85,4 @@ def _size_m(row: Row) -> Float[Tensor, "3"]:
 
 @lru_cache(maxsize=32)
 def _read(store: Store, name: str) -> ActorModel:
-    return read_asset(LibraryActor.named(store, name).path)
+    return read_asset(LibraryActor.named(store, name).path).with_points_all_round()

@@ -303,3 +303,18 @@ def test_a_style_is_read_and_left_to_the_end():
     for wrong in ({"prompt": "snow"}, {"prompt": "rain", "visibility_m": 50.0}):
         with pytest.raises(ConfigError):
             parse_operations([{"op": "style", **wrong}], "test")
+
+
+def test_an_actor_that_lidar_saw_from_one_side_has_points_all_round():
+    sides = torch.tensor([-0.9, 0.9])
+    means = torch.cartesian_prod(torch.linspace(-2, 2, 9), sides, torch.zeros(1))
+    grey = torch.full_like(means, 0.5)
+    seen = ActorModel(
+        gaussians=round_gaussians(means, grey, sigma_m=0.1),
+        points=map_points(means[means[:, 1] > 0], grey[means[:, 1] > 0]),
+        size_m=torch.tensor([4.0, 1.8, 1.5]),
+        category="car",
+    )
+    points = seen.with_points_all_round().points
+    assert sorted(points.xyz_m[:, 1].sign().tolist()) == [-1.0] * 9 + [1.0] * 9
+    assert points.has_colour.all()
