@@ -45,12 +45,13 @@ def test_a_later_round_paints_farther_out(tiny_run):
     words = ("--painter", "warp", "--shift", "2", *changes, "--no-evaluate", "--no-report")
     result = reconstructed(tiny_run, *words, "--json").json
     assert {"refine-1", "refine-2"} <= set(result["seconds"])
-    for stage, names in (
-        ("paint-1", ("left-2m", "right-2m")),
-        ("paint-2", ("left-3m", "right-3m")),
+    turned = {"turned-left-40deg", "turned-right-40deg"}
+    for stage, aside in (
+        ("paint-1", {"left-2m", "right-2m"}),
+        ("paint-2", {"left-3m", "right-3m"}),
     ):
         shown = Path(result["artefacts"][stage]) / "images"
-        assert sorted(path.name for path in shown.iterdir()) == list(names)
+        assert {path.name for path in shown.iterdir()} == aside | turned
 
 
 def test_a_round_that_is_taken_back_is_made_again_as_its_control(tiny_run, monkeypatch):
