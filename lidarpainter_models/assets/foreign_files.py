@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 MOST_BYTES = 512 * 2**20
-"""Of all files of one asset."""
+"""Limit on the size of all files of one asset together."""
 UNREADABLE = (
     *(ArithmeticError, AssertionError, AttributeError, ImportError, LookupError, MemoryError),
     *(OSError, RuntimeError, SyntaxError, TypeError, ValueError),
 )
-"""What readers of other people raise about a damaged file."""
+"""Errors that other people's readers raise about a damaged file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 SPLATS = "; Gaussians are imported as PLY or SPZ"
+"""Ends the message about a file without triangles, which may be meant to hold Gaussians."""
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tga", ".bmp", ".dds", ".ktx2", ".tif", ".tiff")
+"""How the names of textures end; whatever else is read beside a mesh is no image."""
 TRIANGLES = 4
 """How a primitive of glTF says that it is drawn as triangles."""
 MOST_TRIANGLES = 5_000_000
-"""Of all parts, each as often as it is shown."""
+"""Limit on the triangles of all parts, each counted as often as it is shown."""
 
 
 def read_meshes(folder: ForeignFolder, *, num_textures: int | None = None) -> ForeignShape:
@@ -82,9 +84,10 @@ def moved_part(mesh: "Trimesh", pose: Float[np.ndarray, "4 4"]) -> "Trimesh":
 
 def _shared_images(meshes: Iterable[Any]) -> list[Any]:
     """The different images of meshes; an .mtl may name one file in many materials."""
-    by_path, images = {}, {}
+    by_path: dict[Any, Any] = {}
+    images: dict[int, Any] = {}
     for mesh in meshes:
-        material = getattr(getattr(mesh, "visual", None), "material", None)
+        material: Any = getattr(getattr(mesh, "visual", None), "material", None)
         if getattr(material, "image", None) is not None:
             path = material.image.info.get("file_path", id(material.image))
             material.image = by_path.setdefault(path, material.image)

@@ -22,7 +22,8 @@ COLOURS = ("diffuseColor", "diffuse_texture", "diffuse_color_constant")
 TINT = "diffuse_tint"
 """What OmniPBR multiplies a texture by; its plain colour does not count beside a texture."""
 CODE = ".mdl"
-"""Ending of materials' code, which comes with their programs, not with a file."""
+"""NVIDIA's materials name their code by a file that ends so. It comes with NVIDIA's programs and
+need not lie beside a stage; nothing reads it here."""
 
 
 def read_usd(folder: ForeignFolder) -> ForeignShape:
@@ -171,10 +172,10 @@ class _Stage:
         if not shader:
             return None
         said, image, factor = [self._input(shader, name) for name in COLOURS], None, None
-        textures = [one.resolvedPath for one in said if getattr(one, "path", "")]
+        files: list[Any] = [one for one in said if getattr(one, "path", "")]
         plain = [one for one in said if one is not None and not hasattr(one, "resolvedPath")]
-        if textures:
-            image, factor = self._image(textures[0]), self._input(shader, TINT)
+        if files:
+            image, factor = self._image(files[0].resolvedPath), self._input(shader, TINT)
         elif plain:
             factor = plain[0]
         opacity = self._input(shader, "opacity")

@@ -34,13 +34,15 @@ LONGEST_M: dict[str, tuple[float, float]] = {
     "bicycle": (0.8, 4),
     "pedestrian": (0.5, 2.6),
 }
-"""Least and most of the longest side, by category."""
+"""Shortest and longest that the longest side may be, by category."""
 ANY_LONGEST_M = (0.05, 60.0)
+"""The same for every other category."""
 FLATTEST = 0.01
 """Every side must have at least this share of the longest one: a flat thing has no volume."""
 MOST_UNLIKE = 1.25
 """Once it is scaled to the length of `--size`, width and height may differ by this factor."""
 MOST_GAUSSIANS = 1_000_000
+"""Limit on the Gaussians of one file: more are a whole scene."""
 UPRIGHT = ("pedestrian", "animal")
 """Categories that keep the front of the file, though a longer side lies across it: the shoulders
 of a person are wider than the chest is deep."""
@@ -57,7 +59,7 @@ class Placement:
     """Length, width and height; the shape is scaled to this length."""
     up: Axis | None = None
     forward: Axis | None = None
-    """Where the front is; if absent along the longest horizontal side."""
+    """The axis that the front looks along; if absent, that of the longest horizontal side."""
 
     def __post_init__(self) -> None:
         """Refuse a placement that makes no sense.

@@ -22,21 +22,24 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 MOST = 30_000
-"""Gaussians of one asset, about: a car's are then 3 cm apart."""
+"""Gaussians of one asset, roughly: those of a car are then 3 cm apart."""
 SPACING_M = 0.02
-"""Between neighbours, at least."""
+"""Neighbours are at least this far apart."""
 SPREAD, THICKNESS = 0.75, 0.08
 """Standard deviations along and across the surface, in spacings."""
 OVERLAP = 2 * np.pi * SPREAD**2
-"""How many Gaussians lie over one another."""
+"""Mean number of Gaussians that lie over one another at a place."""
 LEAST_OPAQUE, MOST_OPAQUE = 0.02, 0.999_999
+"""Places that are less opaque get no Gaussian; none is more opaque, for logits are finite."""
 SOLID = 0.5
-"""What is less opaque hides nothing: glass."""
+"""A part whose mean opacity is less than this is glass: it hides nothing behind it."""
 NUM_DIRECTIONS, LIFT_M = 48, 0.003
+"""Directions from which a place is looked for, and how far off its surface a ray begins."""
 GROUND_SHARE = 0.15
-"""Light of an even sky that a road gives back."""
+"""Share of the light of an even sky that a road reflects upwards."""
 MOST_TRIED = 20
-"""Places that are looked at for one that is seen: most of a car may lie inside."""
+"""Limit on the places that are tried for each Gaussian that is wanted: where most of a thing lies
+hidden inside, it gets fewer Gaussians in place of endless work."""
 
 Places = Float[np.ndarray, "places 10"]
 """Places on surfaces: point and normal in the box frame, colour in linear light, opacity."""

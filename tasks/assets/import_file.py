@@ -31,7 +31,7 @@ NAME_LENGTH = 40
 def import_file(
     store: Store, path: Path, placement: Placement, licence: str | None
 ) -> dict[str, Any]:
-    """Write a file as an artefact and enter it; the same file again takes its own place.
+    """Write a file as an artefact and enter it; the same file again replaces its own row.
 
     Without a licence the one that is known of the file stays.
 
