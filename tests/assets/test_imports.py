@@ -19,7 +19,7 @@ from foreign_cars import (
 )
 from PIL import Image
 
-from lidarpainter_models.assets import foreign_files, foreign_meshes, surface_gaussians
+from lidarpainter_models.assets import foreign_files, foreign_meshes, foreign_usd, surface_gaussians
 from lidarpainter_models.assets.extraction import BACKGROUND, WIDTH_PX, turntable
 from lidarpainter_models.assets.foreign_files import ForeignFolder
 from lidarpainter_models.assets.import_formats import IMPORT_FORMATS, import_format
@@ -378,6 +378,9 @@ def test_what_grows_beyond_reason_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(foreign_meshes, "MOST_TRIANGLES", 100)
     with pytest.raises(DataError, match="108 triangles, expected 1 to 100"):
         taken(path)
+    monkeypatch.setattr(foreign_usd, "MOST_TRIANGLES", 11)
+    with pytest.raises(DataError, match="/Box makes more than 11 triangles"):
+        taken(write_usd_quads(tmp_path / "box.usda"), category="thing")
     monkeypatch.setattr(foreign_files, "MOST_BYTES", 100)
     with pytest.raises(DataError, match="larger than 0 MB"):
         taken(path)
