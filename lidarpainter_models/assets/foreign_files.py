@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 from lidarpainter_models.assets.import_formats import Axis
 from lidarpainter_models.errors import DataError
@@ -18,12 +19,12 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 MOST_BYTES = 512 * 2**20
-"""Of all files of one asset."""
+"""Limit on the size of all files of one asset together."""
 UNREADABLE = (
     *(ArithmeticError, AssertionError, AttributeError, ImportError, LookupError, MemoryError),
     *(OSError, RuntimeError, SyntaxError, TypeError, ValueError),
 )
-"""What readers of other people raise about a damaged file."""
+"""Errors that other people's readers raise about a damaged file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,21 +57,33 @@ class ForeignFolder:
         self.digests: dict[Path, str] = {}
         """SHA-256 of all that was read."""
         self.problem: str | None = None
-        """What was asked for and not given: whoever calls a reader that goes on then must not."""
+        """The last refusal: trimesh passes over what it was refused, its caller must look here."""
 
     @property
     def content(self) -> bytes:
         """The file itself; raises as `get` does."""
         return self.get(self.file.name)
 
+    @property
+    def contents(self) -> list[tuple[str, str]]:
+        """All that was read: its place in the folder (none for the file itself), and SHA-256.
+
+        Two textures that change places make another car; another name for the file does not.
+        """
+        names = {one: one.relative_to(self.file.parent).as_posix() for one in self.digests}
+        names[self.file] = ""
+        return sorted((names[one], digest) for one, digest in self.digests.items())
+
     def get(self, name: str) -> bytes:
-        """The bytes of something that the file names.
+        """The bytes of something that the file names, as it is or percent-encoded as in a URI.
 
         Raises:
             DataError: it leads out of the folder, is not there, or is too large with all others.
         """
         before, self.problem = self.problem, f"{self.file}: names {name[:200]!r}, which is no file"
-        path = (self.file.parent / name.strip().replace("\\", "/")).resolve()
+        path = self._place(name)
+        if not path.is_file():
+            path = self._place(unquote(name))
         if not path.is_relative_to(self.file.parent):
             self.problem = f"{self.file}: names {name[:200]!r}, expected a file of its own folder"
         elif not path.is_file():
@@ -85,3 +98,6 @@ class ForeignFolder:
         raise DataError(self.problem)
 
     __getitem__ = get
+
+    def _place(self, name: str) -> Path:
+        return (self.file.parent / name.strip().replace("\\", "/")).resolve()

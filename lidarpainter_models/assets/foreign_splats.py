@@ -31,7 +31,7 @@ def read_spz_splats(folder: ForeignFolder) -> ForeignShape:
     """Gaussians of an SPZ file, in its own frame.
 
     Raises:
-        DataError: it is no such file, or grows beyond all reason when it is unpacked.
+        DataError: it is no SPZ file, or is larger than `MOST_BYTES` when it is unpacked.
         MissingPackageError: the extra `export` is not installed.
     """
     unpacking, content = zlib.decompressobj(_GZIP_BITS), folder.content

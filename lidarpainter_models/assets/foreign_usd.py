@@ -6,21 +6,24 @@ that of NVIDIA's OmniPBR. Needs usd-core (extra `export`).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from io import BytesIO
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from lidarpainter_models.assets.foreign_files import UNREADABLE, ForeignFolder, ForeignShape
-from lidarpainter_models.assets.foreign_meshes import MOST_TRIANGLES, SPLATS, checked_part
+from lidarpainter_models.assets.foreign_images import load_images, opened_image
+from lidarpainter_models.assets.foreign_meshes import MOST_TRIANGLES, SPLATS, moved_part
 from lidarpainter_models.errors import DataError, MissingPackageError
 
 COLOURS = ("diffuseColor", "diffuse_texture", "diffuse_color_constant")
-"""Inputs of shaders that say a colour or name its texture."""
+"""Inputs of shaders that say a colour or name its texture; the first that does is taken."""
+TINT = "diffuse_tint"
+"""What OmniPBR multiplies a texture by; its plain colour does not count beside a texture."""
 CODE = ".mdl"
-"""Ending of materials' code, which comes with their programs, not with a file."""
+"""NVIDIA's materials name their code by a file that ends so. It comes with NVIDIA's programs and
+need not lie beside a stage; nothing reads it here."""
 
 
 def read_usd(folder: ForeignFolder) -> ForeignShape:
@@ -69,11 +72,13 @@ def _look_up(folder: ForeignFolder) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """An opened stage at a time; all are of pxr, which has no types."""
+    """An opened stage at one moment; objects of pxr have no types."""
 
     stage: Any
     folder: ForeignFolder
     time: Any
+    images: dict[str, Any] = field(default_factory=dict)
+    """Textures that were decoded, by place."""
 
     def parts(self) -> Iterator[Any]:
         """Meshes that are drawn, as triangles in the frame of the stage, apart by material."""
@@ -81,10 +86,13 @@ class _Stage:
 
         poses, count = UsdGeom.XformCache(self.time), 0
         for prim in Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-            pose = np.array(poses.GetLocalToWorldTransform(prim)).T
-            for part in self._of(UsdGeom.Mesh(prim)) if self._is_drawn(prim) else ():
+            if prim.IsA(UsdGeom.PointInstancer):
+                said = f"{self.folder.file}: {prim.GetPath()} is a point instancer"
+                raise DataError(f"{said}, expected meshes that stand in the stage themselves")
+            pose, most = np.array(poses.GetLocalToWorldTransform(prim)).T, MOST_TRIANGLES - count
+            for part in self._of(UsdGeom.Mesh(prim), most) if self._is_drawn(prim) else ():
                 count += len(part.faces)
-                yield checked_part(part).apply_transform(pose)
+                yield moved_part(part, pose)
             count += 1
             if count > MOST_TRIANGLES:
                 raise DataError(f"{self.folder.file}: more than {MOST_TRIANGLES} triangles")
@@ -96,8 +104,8 @@ class _Stage:
         is_drawn = mesh and mesh.ComputePurpose() in (words.default_, words.render)
         return bool(is_drawn) and mesh.ComputeVisibility(self.time) != words.invisible
 
-    def _of(self, mesh: Any) -> Iterator[Any]:  # noqa: ANN401
-        """A mesh in its own frame."""
+    def _of(self, mesh: Any, most: int) -> Iterator[Any]:  # noqa: ANN401
+        """A mesh in its own frame, of at most so many triangles."""
         import trimesh
         from pxr import UsdShade
 
@@ -105,8 +113,12 @@ class _Stage:
             np.array(one.Get(self.time), int)
             for one in (mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr())
         )
+        points = np.array(mesh.GetPointsAttr().Get(self.time), float)
+        problem = _problem_of(counts, names, len(points), most)
+        if problem:
+            raise DataError(f"{self.folder.file}: {mesh.GetPath()} {problem}")
         faces, corners = _fans(counts)
-        vertices = np.array(mesh.GetPointsAttr().Get(self.time), float)[names[corners]]
+        vertices = points[names[corners]]
         where = {
             "faceVarying": corners,
             "uniform": np.repeat(faces[:, None], 3, 1),
@@ -152,7 +164,6 @@ class _Stage:
 
     def _material(self, material: Any) -> Any | None:  # noqa: ANN401
         """The colour of a material, as trimesh has it; None where there is none."""
-        from PIL import Image
         from trimesh.visual.material import PBRMaterial
 
         shader = material and (
@@ -160,15 +171,17 @@ class _Stage:
         )
         if not shader:
             return None
-        image, said = None, [found for name in COLOURS if (found := self._input(shader, name))]
-        textures = [one for one in said if hasattr(one, "resolvedPath")]
-        plain = [one for one in said if not hasattr(one, "resolvedPath")]
-        if textures:
-            image = Image.open(BytesIO(self._bytes(textures[0].resolvedPath)))
+        said, image, factor = [self._input(shader, name) for name in COLOURS], None, None
+        files: list[Any] = [one for one in said if getattr(one, "path", "")]
+        plain = [one for one in said if one is not None and not hasattr(one, "resolvedPath")]
+        if files:
+            image, factor = self._image(files[0].resolvedPath), self._input(shader, TINT)
+        elif plain:
+            factor = plain[0]
         opacity = self._input(shader, "opacity")
         alpha = opacity if isinstance(opacity, float) else 1.0
         return PBRMaterial(
-            baseColorFactor=np.clip([*(plain[0] if plain else (1, 1, 1)), alpha], 0, 1),
+            baseColorFactor=np.clip([*((1, 1, 1) if factor is None else factor), alpha], 0, 1),
             baseColorTexture=image,
             alphaMode="BLEND" if alpha < 1 else "OPAQUE",
         )
@@ -184,6 +197,13 @@ class _Stage:
             return attribute.Get(self.time)
         return None
 
+    def _image(self, place: str) -> Any:  # noqa: ANN401
+        """A texture, decoded once however many parts show it."""
+        if place not in self.images:
+            self.images[place] = opened_image(self.folder.file, self._bytes(place))
+            load_images(self.folder.file, self.images.values())
+        return self.images[place]
+
     def _bytes(self, place: str) -> bytes:
         """A file that a material names, in the package or the folder."""
         from pxr import Ar
@@ -191,6 +211,26 @@ class _Stage:
         if place.startswith(f"{self.folder.file}["):
             return bytes(Ar.GetResolver().OpenAsset(Ar.ResolvedPath(place)).GetBuffer())
         return self.folder.get(place)
+
+
+def _problem_of(
+    counts: Int[np.ndarray, " polygons"],
+    names: Int[np.ndarray, " corners"],
+    num_points: int,
+    most: int,
+) -> str | None:
+    """What is wrong with the polygons that a mesh says it has, if anything is.
+
+    Asked before any memory is taken by these numbers, which may be anything.
+    """
+    is_odd = len(counts) and (counts.min() < 0 or counts.max() > len(names))
+    if is_odd or counts.sum() != len(names):
+        return "has polygons of more or fewer corners than it lists"
+    if len(names) and (names.min() < 0 or names.max() >= num_points):
+        return "names vertices that it does not have"
+    if np.maximum(counts - 2, 0).sum() > most:
+        return f"makes more than {MOST_TRIANGLES} triangles"
+    return None
 
 
 def _fans(

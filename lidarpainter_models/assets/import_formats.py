@@ -58,9 +58,9 @@ class ImportFormat:
     read: Callable[["ForeignFolder"], "ForeignShape"]
     """Reads the file of a folder, in its own frame."""
     up: Axis
-    """Where its up is if neither file nor user says so."""
+    """The axis that points up, if neither the file nor the user says which."""
     forward: Axis
-    """Where its front is by custom, if that is up."""
+    """The axis along which things of this format look by custom, while `up` is their up."""
 
 
 IMPORT_FORMATS = (

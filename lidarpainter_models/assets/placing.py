@@ -34,17 +34,20 @@ LONGEST_M: dict[str, tuple[float, float]] = {
     "bicycle": (0.8, 4),
     "pedestrian": (0.5, 2.6),
 }
-"""Least and most of the longest side, by category."""
+"""Shortest and longest that the longest side may be, by category."""
 ANY_LONGEST_M = (0.05, 60.0)
+"""The same for every other category."""
 FLATTEST = 0.01
-"""Share of the longest side that every other must reach."""
+"""Every side must have at least this share of the longest one: a flat thing has no volume."""
 MOST_UNLIKE = 1.25
-"""How far width and height may be from `--size`, as a factor, once the length is as said."""
+"""Once it is scaled to the length of `--size`, width and height may differ by this factor."""
 MOST_GAUSSIANS = 1_000_000
+"""Limit on the Gaussians of one file: more are a whole scene."""
 UPRIGHT = ("pedestrian", "animal")
-"""Who is not turned so that the longest side points ahead: shoulders are wider than a chest."""
+"""Categories that keep the front of the file, though a longer side lies across it: the shoulders
+of a person are wider than the chest is deep."""
 BLACKEST = 1e-3
-"""Of a colour: exact black marks the contact shadow that an edit takes away."""
+"""Least value of a colour: exact black marks a contact shadow, which an edit takes away."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,13 +59,13 @@ class Placement:
     """Length, width and height; the shape is scaled to this length."""
     up: Axis | None = None
     forward: Axis | None = None
-    """Where the front is; if absent along the longest horizontal side."""
+    """The axis that the front looks along; if absent, that of the longest horizontal side."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Refuse a placement that makes no sense.
 
         Raises:
-            ConfigError: no category, or a size that is none.
+            ConfigError: the category is empty, or the size is not three positive lengths.
         """
         if not self.category.strip():
             raise ConfigError("--category is empty, expected a word such as car")
@@ -76,8 +79,8 @@ def placed_actor(
     """An actor in our box frame, and which axes of the file were taken for up and ahead.
 
     Raises:
-        ConfigError: front and up lie in one axis.
-        DataError: nothing in it is opaque, or its size is none of such a thing.
+        ConfigError: the front and up lie along the same axis of the file.
+        DataError: nothing in it is opaque, or nothing of its category is as large or as small.
     """
     up = said.up or shape.up or row.up
     custom = row.forward if up == row.up else ("x" if up[-1] == "z" else "z")

@@ -9,6 +9,7 @@ from typing import Any
 from catalog.artefacts import Workplace
 from catalog.assets import enter_sightings
 from catalog.digests import canonical_json, digest_text
+from catalog.schemas import SIGHTINGS
 from catalog.store import Store
 from lidarpainter_models.assets.asset_files import write_asset
 from lidarpainter_models.assets.extraction import THUMBNAIL_FILE, turntable
@@ -30,7 +31,9 @@ NAME_LENGTH = 40
 def import_file(
     store: Store, path: Path, placement: Placement, licence: str | None
 ) -> dict[str, Any]:
-    """Write a file as an artefact and enter it; the same file again takes its own place.
+    """Write a file as an artefact and enter it; the same file again replaces its own row.
+
+    Without a licence the one that is known of the file stays.
 
     Returns:
         What `--json` prints.
@@ -41,7 +44,7 @@ def import_file(
     """
     row, folder = import_format(path), ForeignFolder(path)
     shape = row.read(folder)
-    digest = digest_text(canonical_json(sorted(folder.digests.values())))
+    digest = digest_text(canonical_json(folder.contents))
     made = run_stage(
         store,
         stage="import-asset",
@@ -55,7 +58,7 @@ def import_file(
         "dataset": ORIGIN,
         "scene_id": place,
         "frame": place,
-        "licence": licence or NO_LICENCE,
+        "licence": licence or _known_licence(store, digest),
         "run_id": None,
         "style": None,
         "artefact_id": made.ref.artefact_id,
@@ -71,6 +74,12 @@ def import_file(
         "artefact": str(store.artefacts.folder(made.ref)),
         "is_new": made.is_new,
     }
+
+
+def _known_licence(store: Store, digest: str) -> str:
+    """What an earlier import of the same file said."""
+    rows = store.tables.rows(SIGHTINGS.name, where={"actor_id": {digest}})
+    return next((row["licence"] for row in rows if row["dataset"] == ORIGIN), NO_LICENCE)
 
 
 def _build(

@@ -8,14 +8,21 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from foreign_cars import SIZE_M, WRITERS, write_glb, write_obj, write_usd, write_usd_quads
+from foreign_cars import (
+    SIZE_M,
+    WRITERS,
+    taken,
+    write_glb,
+    write_obj,
+    write_usd,
+    write_usd_quads,
+)
 from PIL import Image
 
-from lidarpainter_models.assets import foreign_files, foreign_meshes, surface_gaussians
+from lidarpainter_models.assets import foreign_files, foreign_meshes, foreign_usd, surface_gaussians
 from lidarpainter_models.assets.extraction import BACKGROUND, WIDTH_PX, turntable
 from lidarpainter_models.assets.foreign_files import ForeignFolder
 from lidarpainter_models.assets.import_formats import IMPORT_FORMATS, import_format
-from lidarpainter_models.assets.placing import Placement, placed_actor
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.export.spz_files import write_spz
 from lidarpainter_models.gaussians.model.ply_files import write_ply
@@ -26,12 +33,6 @@ from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 def few(monkeypatch):
     """Fewer Gaussians, as far apart as a test needs."""
     monkeypatch.setattr(surface_gaussians, "MOST", 4000)
-
-
-def taken(path, **said):
-    row = import_format(path)
-    shape = row.read(ForeignFolder(path))
-    return placed_actor(shape, row, Placement(**{"category": "car", **said}))[0]
 
 
 def coloured(model, *, above=(), below=()):
@@ -233,6 +234,29 @@ def hostile_usd(folder, layer):
     return path
 
 
+def lying_usd(folder, counts=None, names=None):
+    """A box of quads that says something else of its faces."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(write_usd_quads(folder / "box.usda")))
+    (mesh,) = (UsdGeom.Mesh(one) for one in stage.Traverse() if one.IsA(UsdGeom.Mesh))
+    if counts is not None:
+        mesh.GetFaceVertexCountsAttr().Set(counts)
+    if names is not None:
+        mesh.GetFaceVertexIndicesAttr().Set(names)
+    stage.Save()
+    return folder / "box.usda"
+
+
+def instanced_usd(folder):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(write_usd(folder / "car.usda")))
+    UsdGeom.PointInstancer.Define(stage, "/World/Bolts")
+    stage.Save()
+    return folder / "car.usda"
+
+
 def nowhere(folder):
     mesh = trimesh.creation.box((4, 2, 1.5))
     mesh.vertices[3] = np.nan
@@ -291,6 +315,27 @@ HOSTILE = {
         lambda f: written(f, "car.obj", b"v 0 0 0\nv 4 0 0\nv 0 0 4\nf 1 2 3\n"),
         "4 x 4 x 0 in its own unit, expected a thing with a volume",
     ),
+    "usd with a face of billions": (
+        lambda f: lying_usd(f, counts=[2_000_000_000]),
+        "more or fewer corners than it lists",
+    ),
+    "usd with a face of less than nothing": (
+        lambda f: lying_usd(f, counts=[4, 4, 4, 4, 4, 8, -4]),
+        "more or fewer corners than it lists",
+    ),
+    "usd with a vertex before the first": (
+        lambda f: lying_usd(f, names=[-1, *range(1, 8)] * 3),
+        "names vertices that it does not have",
+    ),
+    "usd with a vertex after the last": (
+        lambda f: lying_usd(f, names=[8, *range(1, 8)] * 3),
+        "names vertices that it does not have",
+    ),
+    "usd with instances at points": (instanced_usd, "/World/Bolts is a point instancer"),
+    "an opacity that is no number": (
+        lambda f: hostile_obj(f, "d much"),
+        "expected a number",
+    ),
     "columns without bytes": (
         lambda f: changed_gltf(f, lambda d: d["accessors"][0].pop("bufferView")),
         "packed columns",
@@ -333,6 +378,9 @@ def test_what_grows_beyond_reason_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(foreign_meshes, "MOST_TRIANGLES", 100)
     with pytest.raises(DataError, match="108 triangles, expected 1 to 100"):
         taken(path)
+    monkeypatch.setattr(foreign_usd, "MOST_TRIANGLES", 11)
+    with pytest.raises(DataError, match="/Box makes more than 11 triangles"):
+        taken(write_usd_quads(tmp_path / "box.usda"), category="thing")
     monkeypatch.setattr(foreign_files, "MOST_BYTES", 100)
     with pytest.raises(DataError, match="larger than 0 MB"):
         taken(path)

@@ -11,6 +11,10 @@ from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from lidarpainter_models.assets.foreign_files import ForeignFolder
+from lidarpainter_models.assets.import_formats import import_format
+from lidarpainter_models.assets.placing import Placement, placed_actor
+
 SIZE_M = (4.5, 1.8, 1.5)
 GLTF_FROM_BOX = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
 """x left, y up, z ahead."""
@@ -197,3 +201,10 @@ def write_usd_quads(path):
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
     stage.Save()
     return path
+
+
+def taken(path, **said):
+    """The actor that a file becomes; a car unless it is said otherwise."""
+    row = import_format(path)
+    shape = row.read(ForeignFolder(path))
+    return placed_actor(shape, row, Placement(**{"category": "car", **said}))[0]
