@@ -1,4 +1,6 @@
-"""Decode stored images: the one place of the library where bytes become pixels.
+"""Decode stored images: the one place of the library where bytes of a log become pixels.
+
+Textures of imported meshes are Pillow's, as trimesh wants them (`assets/foreign_images.py`).
 
 A store keeps JPEG images alone: what a log has otherwise is made one here, once.
 
