@@ -1,6 +1,6 @@
 """Where the actors of an edit come from: other runs, the library of assets, files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
