@@ -41,7 +41,7 @@ class SeenSurface:
     """Pixels per metre times the cosine of the look, squared, summed over looks; 0: never seen."""
     rgb_sum: Float[Tensor, "places 3"]
     square_sum: Float[Tensor, " places"]
-    """Likewise of squares, the mean of the channels: it tells how far looks agree."""
+    """Weighted squares of the colours, the mean of the channels: they tell how far looks agree."""
 
     @classmethod
     def of(cls, model: ActorModel) -> "SeenSurface":

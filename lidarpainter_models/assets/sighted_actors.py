@@ -90,8 +90,8 @@ def _add(
             sighting.add_look(seen, look.camera.fx_px)
         if maps is not None:
             sighting.add_error(seen, *maps)
-    if look.shown is not None and surfaces:
-        own = [(surfaces.get(tracks[row].actor_id), here[row], seen) for row, seen in both]
+    own = [(surfaces.get(tracks[row].actor_id), here[row], seen) for row, seen in both]
+    if look.shown is not None and any(surface is not None for surface, _, _ in own):
         _add_colours(look, look.shown(), depth_m, own)
 
 
@@ -101,7 +101,7 @@ def _add_colours(
     depth_m: Float[Tensor, "height width"],
     seen: Sequence[tuple[SeenSurface | None, Float[Tensor, "4 4"], BoxView]],
 ) -> None:
-    """What one image shows of surfaces, the nearest first: where its box is, the others are not."""
+    """What one image shows of surfaces, the nearest first: pixels of its box show no other one."""
     is_free = shown.shows_surface.clone()
     for surface, world_from_box, view in sorted(
         seen, key=lambda one: float(one[2].camera_box.norm())

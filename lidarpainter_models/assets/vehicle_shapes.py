@@ -61,7 +61,7 @@ class VehicleShape:
     """Of the shape's frame in the box frame."""
 
     def signed_distance(self, points_box: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
-        """Metres to the surface, negative inside; beyond the grid at least as far as it is."""
+        """Metres to the surface, negative inside, cut off at `TRUNCATION_M`."""
         own = self._own(points_box) / (self.size_m / 2)
         return _sampled(self.field_m[None], own)[:, 0]
 

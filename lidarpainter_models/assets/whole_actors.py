@@ -21,14 +21,17 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 
 SHAPED = ("car", "van", "pickup", "vehicle")
 """Categories whose shapes are known."""
-SHAPED_LENGTH_M, SHAPED_HEIGHT_M = (3.0, 6.2), (1.2, 2.8)
-"""Of boxes whose shapes are known: a data set's `vehicle` may be a bus."""
+SHAPED_M = ((3.0, 6.2), (1.2, 2.8), (1.2, 2.8))
+"""Least and most length, width and height of boxes whose shapes are known: what a data set calls a
+vehicle may be a bus."""
 LEAST_GAUSSIANS = 20
 """An actor of fewer is a smear."""
 LEAST_SEEN = 0.02
 """Share of a surface that must have been seen: of less the colours are unknown."""
 BEYOND = 1.1
-"""No Gaussian reaches farther than so many half sizes of the box, but antennas and mirrors."""
+"""No Gaussian reaches farther than so many half sizes of the box."""
+LEAST_SHRUNK = 0.05
+"""Gaussians that would have to shrink by more are left out."""
 SIGMAS = 2.0
 """Where a Gaussian ends that is seen against a bright background: at a tenth of its middle."""
 
@@ -50,12 +53,9 @@ def surfaces_of(world: EditedWorld) -> dict[str, SeenSurface]:
 
 def is_shaped(track: ActorTrack) -> bool:
     """Whether the shape of an actor is one that is known."""
-    length_m, _, height_m = track.size_m.tolist()
-    return (
-        category_of(track.category) in SHAPED
-        and SHAPED_LENGTH_M[0] <= length_m <= SHAPED_LENGTH_M[1]
-        and SHAPED_HEIGHT_M[0] <= height_m <= SHAPED_HEIGHT_M[1]
-    )
+    sides = zip(track.size_m.tolist(), SHAPED_M, strict=True)
+    has_size = all(least <= side <= most for side, (least, most) in sides)
+    return category_of(track.category) in SHAPED and has_size
 
 
 def whole_actor(model: ActorModel, surface: SeenSurface | None) -> WholeActor:
@@ -68,7 +68,7 @@ def whole_actor(model: ActorModel, surface: SeenSurface | None) -> WholeActor:
 
 
 def kept_in_box(gaussians: GaussianSet, size_m: Float[Tensor, "3"]) -> GaussianSet:
-    """Gaussians whose middle is inside a box, none reaching beyond `BEYOND` of it.
+    """Gaussians whose middle is inside `BEYOND` of a box, none reaching beyond that.
 
     Whoever reaches farther is shrunk along all of its axes alike: a spike that only training views
     showed from its end becomes what they showed.
@@ -78,5 +78,7 @@ def kept_in_box(gaussians: GaussianSet, size_m: Float[Tensor, "3"]) -> GaussianS
     own = gaussians.select(inside.nonzero()[:, 0])
     axes = rotation_from_quaternion(own.rotation_wxyz) * own.scale_m[:, None]
     reach_m = SIGMAS * axes.norm(dim=2)
-    factor = ((room_m - own.means.abs()) / reach_m).amin(1).clamp(max=1.0, min=0.05)
-    return replace(own, log_scale=own.log_scale + factor.log()[:, None])
+    factor = ((room_m - own.means.abs()) / reach_m).amin(1).clamp(max=1.0)
+    kept = (factor >= LEAST_SHRUNK).nonzero()[:, 0]
+    own = own.select(kept)
+    return replace(own, log_scale=own.log_scale + factor[kept].log()[:, None])

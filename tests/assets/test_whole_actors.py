@@ -27,12 +27,14 @@ from lidarpainter_models.assets.vehicle_shapes import BUNDLED, MATERIALS, fitted
 from lidarpainter_models.assets.whole_actors import (
     BEYOND,
     SIGMAS,
+    is_shaped,
     kept_in_box,
     surfaces_of,
     whole_actor,
 )
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.storage.tensor_files import read_tensors
 
 SIZE_M = torch.tensor([4.7, 1.98, 1.45])
@@ -216,3 +218,21 @@ def test_a_parked_car_is_published_whole_with_its_origins(tmp_path):
     assert set(tensors["origin"][front].tolist()) <= {MIRRORED, GUESSED}
     red, green, _ = gaussians.base_rgb[front].median(0).values.tolist()
     assert red > 1.5 * green
+
+
+def test_a_box_that_no_vehicle_fills_is_left_alone():
+    flat, car = (
+        ActorTrack(
+            actor_id="one",
+            category="car",
+            is_moving=False,
+            size_m=torch.tensor(size_m),
+            frame_indices=torch.zeros(1, dtype=torch.int64),
+            timestamps_ns=torch.zeros(1, dtype=torch.int64),
+            world_from_box=torch.eye(4, dtype=torch.float64)[None],
+            num_points=torch.zeros(1, dtype=torch.int64),
+        )
+        for size_m in ([4.2, 0.01, 1.5], [4.2, 1.8, 1.5])
+    )
+    assert not is_shaped(flat)
+    assert is_shaped(car)
