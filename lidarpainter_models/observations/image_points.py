@@ -22,7 +22,7 @@ from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.points_on_actors import MovingBoxes
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.own_body import baseline_m, on_grid
-from lidarpainter_models.observations.plane_sweep import sweep_cost, sweep_depths
+from lidarpainter_models.observations.plane_sweep import depth_between, sweep_cost, sweep_depths
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -145,12 +145,7 @@ def _swept_depth(images: list[_Image], place: int) -> Float[Tensor, "height widt
     best, index = cost.min(dim=0)
     is_near = (torch.arange(len(DEPTHS_M))[:, None, None] - index).abs() <= NEIGHBOURS + 1
     elsewhere = torch.where(is_near, torch.inf, cost).amin(dim=0)
-    # the vertex of the parabola through three costs, in steps of inverse depth
-    middle = index.clamp(1, len(DEPTHS_M) - 2)
-    before, least, after = (cost.gather(0, middle[None] + step)[0] for step in (-1, 0, 1))
-    offset = (before - after) / (2 * (before - 2 * least + after).clamp(min=1e-6))
-    inverse = 1 / DEPTHS_M
-    depth_m = 1 / (inverse[middle] + offset.clamp(-0.5, 0.5) * (inverse[1] - inverse[0]))
+    depth_m = depth_between(cost, index, DEPTHS_M)
     is_clear = best.clamp(min=LEAST_COST) < MOST_COST_RATIO * elsewhere
     is_clear &= (depth_m < FARTHEST_M) & ~image.moves
     return torch.where(is_clear, depth_m, 0.0)

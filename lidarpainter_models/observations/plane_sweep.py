@@ -7,7 +7,7 @@ camera; where the plane passes through the surface, they agree. Depth is camera 
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -102,14 +102,33 @@ def choose_depth(
 ) -> Float[Tensor, "height width"]:
     """The depth of least cost, preferring the expected one where images cannot tell.
 
-    `prior` is the cost of a step of parallax as large as the whole sweep.
+    `depths_m` are even steps of inverse depth; the depth found may lie between two of them. `prior`
+    is the cost of a step of parallax as large as the whole sweep.
     """
     inverse = 1 / depths_m
     span = (inverse.max() - inverse.min()).clamp(min=1e-9)
     expected = (1 / expected_m.clamp(min=float(depths_m.min()))).clamp(max=float(inverse.max()))
     away = (inverse[:, None, None] - expected).abs() / span
-    best = (cost.clamp(min=_SAME_DIFFERENCE) + prior * away).argmin(dim=0)
-    return depths_m[best]
+    total = cost.clamp(min=_SAME_DIFFERENCE) + prior * away
+    return depth_between(total, total.argmin(dim=0), depths_m)
+
+
+def depth_between(
+    cost: Float[Tensor, "depths height width"],
+    index: Int[Tensor, "height width"],
+    depths_m: Float[Tensor, " depths"],
+) -> Float[Tensor, "height width"]:
+    """Depth at the vertex of the parabola through the costs at an index and beside it.
+
+    At most half a step of inverse depth from the index; the first and the last depth stay as they
+    are: what is farther than all has no parallax, and only the last depth has none.
+    """
+    middle = index.clamp(1, len(depths_m) - 2)
+    before, least, after = (cost.gather(0, middle[None] + step)[0] for step in (-1, 0, 1))
+    offset = (before - after) / (2 * (before - 2 * least + after).clamp(min=1e-6))
+    offset = torch.where(middle == index, offset.clamp(-0.5, 0.5), 0)
+    inverse = 1 / depths_m
+    return 1 / (inverse[index] + offset * (inverse[1] - inverse[0]))
 
 
 def _box(image: Float[Tensor, "1 1 height width"], size: int) -> Float[Tensor, "1 1 height width"]:

@@ -18,6 +18,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.observations.image_shrinking import shrink_image
 from lidarpainter_models.observations.plane_sweep import choose_depth, sweep_cost, sweep_depths
 from lidarpainter_models.observations.views import TrainingView
 
@@ -33,8 +34,10 @@ VIEWS_PER_CAMERA = 4  # training views that are looked at, evenly over the log
 MOST_SHARE = 0.12  # at most this part of the start size; a larger stride is taken if need be
 NEAREST_M = 8.0  # nearer things are within every LiDAR's reach
 FARTHEST_M = 800.0  # beyond it a lane's width moves nothing by a pixel
-DEPTHS_M = sweep_depths(NEAREST_M, FARTHEST_M, 24)
-"""Depths tried."""
+DEPTHS_M = sweep_depths(NEAREST_M, FARTHEST_M, 64)
+"""Depths compared: between two, what stands 100 m away and aside moves by a window or less."""
+SWEPT_PX = 640
+"""Images are compared so wide at most."""
 MOST_BELOW_GROUND_M = 1.0
 """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
 
@@ -76,8 +79,15 @@ def _cost_of_depths(
     others = [other for other in of_camera if other.key != view.key]
     if not others or not bool(_open_places(scene, view, _render(scene, view)).any()):
         return None
-    compared = [(other.camera, other.rgb) for other in _evenly(others, COMPARED_VIEWS)]
-    return sweep_cost(view.camera, view.rgb, compared, DEPTHS_M)
+    compared = [_swept(other) for other in _evenly(others, COMPARED_VIEWS)]
+    return sweep_cost(*_swept(view), compared, DEPTHS_M)
+
+
+def _swept(view: TrainingView) -> tuple[Camera, Float[Tensor, "rows columns 3"]]:
+    """A view as it is compared with others."""
+    camera = view.camera.no_wider(SWEPT_PX)
+    image = shrink_image(view.rgb_u8, width_px=camera.width_px, height_px=camera.height_px)
+    return camera, image.float() / 255
 
 
 def _seeds_of_view(
@@ -91,12 +101,22 @@ def _seeds_of_view(
     render = _render(scene, view)
     is_open = _open_places(scene, view, render)
     stride = max(STRIDE_PX, int((int(is_open.sum()) / budget) ** 0.5) + 1)
-    expected_m = depth_from_below(render.depth_m)
+    expected_m = _resized(depth_from_below(render.depth_m), *cost.shape[1:])
     depth_m = choose_depth(cost, DEPTHS_M, expected_m, prior=PRIOR)
+    depth_m = _resized(depth_m, *is_open.shape)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
     rgb = scene.exposure.undone(view.rgb, view.key[1], view.timestamp_ns)
     return _facing_discs(view.camera, rgb, depth_m, is_open & grid, stride, scene.gaussians)
+
+
+def _resized(
+    image: Float[Tensor, "height width"], height_px: int, width_px: int
+) -> Float[Tensor, "rows columns"]:
+    """An image of another size, its nearest pixels."""
+    rows = torch.arange(height_px) * image.shape[0] // height_px
+    columns = torch.arange(width_px) * image.shape[1] // width_px
+    return image[rows[:, None], columns]
 
 
 def _render(scene: GaussianScene, view: TrainingView) -> SceneRender:
