@@ -2,7 +2,7 @@
 
     python scripts/train_vehicle_shapes.py [--without KIND --out FILE]
 
-Writes `lidarpainter_models/assets/bundled/vehicle_shapes.safetensors` anew, with how it came to be
+Writes `lidarpainter_models/lidar/bundled/vehicle_shapes.safetensors` anew, with how it came to be
 in its header. Vehicles are the kinds of the synthetic street, each drawn many times with other
 proportions, so that no vehicle of a street is among them exactly. Equal code gives equal bytes.
 Without a kind, in another file, they tell what shapes are worth for vehicles of no known kind.
@@ -18,7 +18,7 @@ import torch
 from scipy.ndimage import binary_closing, distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
-from lidarpainter_models.assets.vehicle_shapes import (
+from lidarpainter_models.lidar.vehicle_shapes import (
     BUNDLED,
     GRID,
     MATERIALS,

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.assets.completion import MIRRORED, SEEN, WholeActor
+from lidarpainter_models.assets.completion import WholeActor
 from lidarpainter_models.assets.sightings import Sighting
+from lidarpainter_models.lidar.vehicle_colours import MIRRORED, SEEN
 
 NUM_AZIMUTHS = 12
 ELEVATIONS_DEG = (8.0, 30.0)

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.assets.vehicle_shapes import VehicleShape, fitted_shape
 from lidarpainter_models.editing.actor_models import OPAQUE, ActorModel
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.lidar.vehicle_colours import VehiclePlaces
+from lidarpainter_models.lidar.vehicle_shapes import VehicleShape, fitted_shape
 
 SPACING_M = 0.06
 """Between places on the surface: as fine as 17 pixels a metre show."""
@@ -48,9 +49,10 @@ class SeenSurface:
         """The surface that fits the LiDAR points and opaque Gaussians of a model."""
         own = model.gaussians
         is_told = (own.opacity > OPAQUE) & (own.scale_m.amax(1) < WIDEST_M)
-        points = torch.cat([model.points.xyz_m, own.means.detach()[is_told]])
+        measured = model.points.measured()
+        points = torch.cat([measured.xyz_m, own.means.detach()[is_told]])
         weight = torch.ones(len(points))
-        weight[len(model.points) :] = GAUSSIAN_WEIGHT
+        weight[len(measured) :] = GAUSSIAN_WEIGHT
         inside = (points.abs() <= OUTSIDE * model.size_m / 2).all(dim=1)
         shape = fitted_shape(points[inside], weight[inside], model.size_m)
         places, normals = shape.surface(SPACING_M)
@@ -115,6 +117,17 @@ class SeenSurface:
     def rgb(self) -> Float[Tensor, "places 3"]:
         """Mean colours; of places that nobody saw they mean nothing."""
         return self.rgb_sum / self.weight.clamp(min=1e-6)[:, None]
+
+    @property
+    def known(self) -> VehiclePlaces:
+        """The places with the colours that were seen."""
+        return VehiclePlaces(
+            shape=self.shape,
+            places=self.places,
+            normals=self.normals,
+            rgb=self.rgb,
+            is_seen=self.is_seen,
+        )
 
     @property
     def disagreement(self) -> Float[Tensor, " places"]:

@@ -9,21 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.assets.completion import SEEN, WholeActor, completed
+from lidarpainter_models.assets.completion import WholeActor, completed
 from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
-from lidarpainter_models.scenes.categories import category_of
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.lidar.vehicle_colours import SEEN
+from lidarpainter_models.lidar.vehicle_shapes import has_known_shape
 
-SHAPED = ("car", "van", "pickup", "vehicle")
-"""Categories whose shapes are known."""
-SHAPED_M = ((3.0, 6.2), (1.2, 2.8), (1.2, 2.8))
-"""Least and most length, width and height of boxes whose shapes are known: what a data set calls a
-vehicle may be a bus."""
 LEAST_GAUSSIANS = 20
 """An actor of fewer is a smear."""
 LEAST_SEEN = 0.02
@@ -40,7 +35,7 @@ def surfaces_of(world: EditedWorld) -> dict[str, SeenSurface]:
     """The surfaces of the vehicles of a scene, by id, before images tell their colours."""
     found = {}
     for track in world.tracks:
-        if not is_shaped(track):
+        if not has_known_shape(track):
             continue
         try:
             model = world.model_of(track)
@@ -49,13 +44,6 @@ def surfaces_of(world: EditedWorld) -> dict[str, SeenSurface]:
         if len(model.gaussians) >= LEAST_GAUSSIANS:
             found[track.actor_id] = SeenSurface.of(model)
     return found
-
-
-def is_shaped(track: ActorTrack) -> bool:
-    """Whether the shape of an actor is one that is known."""
-    sides = zip(track.size_m.tolist(), SHAPED_M, strict=True)
-    has_size = all(least <= side <= most for side, (least, most) in sides)
-    return category_of(track.category) in SHAPED and has_size
 
 
 def whole_actor(model: ActorModel, surface: SeenSurface | None) -> WholeActor:

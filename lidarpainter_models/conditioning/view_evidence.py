@@ -74,7 +74,7 @@ class EvidenceGatherer:
     def builder(self) -> ConditionBuilder:
         """Carries what is known into views, at their small size."""
         small = [_small_view(view) for view in self._views]
-        coarse = self._lidar_map.thinned(SPACING_RAD)
+        coarse = self._lidar_map.measured().thinned(SPACING_RAD)
         return ConditionBuilder(self.scene, coarse, small, config=GATHERED)
 
     def showing(self, scene: GaussianScene) -> "EvidenceGatherer":

@@ -102,7 +102,7 @@ class EditedWorld:
         if self._body_of(track) is not None:
             points = self.lidar_map.actors.get(track.actor_id, MapPoints.concatenate([]))
         else:
-            pose, street = invert_rigid(_parked_pose(track)), self.lidar_map.street
+            pose, street = invert_rigid(track.middle_pose), self.lidar_map.street
             gaussians = carried_gaussians(gaussians, pose)
             points = street.keep(self._holds(track, street.xyz_m))
             points = replace(points, xyz_m=transform_points(pose.to(points.xyz_m), points.xyz_m))
@@ -185,7 +185,7 @@ class EditedWorld:
         self, track: ActorTrack, points_world: Float[Tensor, "points 3"]
     ) -> Bool[Tensor, " points"]:
         """Which points belong to a parked car and not to the road under it."""
-        pose = _parked_pose(track)
+        pose = track.middle_pose
         held = is_inside_box(points_world, pose, track.size_m, margin_m=PARKED_MARGIN_M)
         rows = held.nonzero()[:, 0]
         bottom_m = torch.full((len(rows),), float(pose[2, 3] - track.size_m[2] / 2))
@@ -218,11 +218,6 @@ def _without_body(scene: GaussianScene, body: int) -> GaussianScene:
         actors=scene.actors.without(body),
         blinking=scene.blinking.without(body),
     )
-
-
-def _parked_pose(track: ActorTrack) -> Float[Tensor, "4 4"]:
-    """Where a parked car stands: its boxes differ by how well they were drawn."""
-    return track.world_from_box[len(track.world_from_box) // 2].double()
 
 
 def _always(track: ActorTrack, log: LogTimes) -> ActorTrack:

@@ -14,6 +14,8 @@ from torch import Tensor
 from lidarpainter_models.devices import on_device
 from lidarpainter_models.scenes.tracks import remembered
 
+NO_FRAME = -1
+"""Frame of a point that was guessed, not measured."""
 _CELL_SIZES = (-6, 1)
 """Exponents of the widths of cells, 16 mm to 2 m."""
 _WIDE, _HIGH = (1 << 21) - 1, (1 << 16) - 1
@@ -31,7 +33,7 @@ class MapPoints:
     has_colour: Bool[Tensor, " points"]
     """Whether an image saw the point."""
     frame_index: Int[Tensor, " points"]
-    """Of the sweep it was measured in."""
+    """Of the sweep it was measured in; `NO_FRAME` of a guess."""
     timestamp_ns: Int[Tensor, " points"]
     """When it was measured."""
     range_m: Float[Tensor, " points"]
@@ -49,6 +51,10 @@ class MapPoints:
     def keep(self, kept: Tensor | slice) -> "MapPoints":
         """The points marked or listed; of a slice nothing is copied."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
+
+    def measured(self) -> "MapPoints":
+        """The points that are no guess."""
+        return self.keep(self.frame_index != NO_FRAME)
 
     def thinned(self, spacing_rad: float) -> "MapPoints":
         """One point of each cell, coloured if the cell has such, in the order of the points.
@@ -130,6 +136,11 @@ class LidarMap:
             return self
         actors = {name: points.to(device) for name, points in self.actors.items()}
         return LidarMap(street=self.street.to(device), actors=actors)
+
+    def measured(self) -> "LidarMap":
+        """The map without what was guessed."""
+        actors = {name: points.measured() for name, points in self.actors.items()}
+        return LidarMap(street=self.street.measured(), actors=actors)
 
     def thinned(self, spacing_rad: float) -> "LidarMap":
         """The map for images as coarse as that: street and actors, as `MapPoints.thinned`."""

@@ -25,6 +25,7 @@ from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.lidar.spatiotemporal_calibration import find_faults
 from lidarpainter_models.lidar.sweep_registration import register_sweeps
+from lidarpainter_models.lidar.whole_vehicles import with_whole_vehicles
 from lidarpainter_models.observations.image_points import points_from_images
 from lidarpainter_models.observations.image_shrinking import fit_camera, shrink_image
 from lidarpainter_models.observations.own_body import on_grid, own_bodies
@@ -176,6 +177,8 @@ def _prepared(
         progress(done, len(split.train) + 1)
     gains = colouring.gains()
     lidar_map = colouring.coloured(gains)
+    if not is_estimated:
+        lidar_map = with_whole_vehicles(lidar_map, scene.tracks)
     progress(len(split.train) + 1, len(split.train) + 1)
     return SceneObservations(
         views=tuple(

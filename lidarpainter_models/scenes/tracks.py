@@ -68,6 +68,14 @@ class ActorTrack:
         """`world_from_box` (float64) between its boxes; beyond its ends the end pose holds."""
         return interpolate_rigid_track(self.timestamps_ns, self.world_from_box, timestamp_ns)
 
+    @property
+    def middle_pose(self) -> Float[Tensor, "4 4"]:
+        """`world_from_box` (float64) of the middle one of its boxes: where a parked actor stands.
+
+        Boxes of one that stands differ by how well they were drawn.
+        """
+        return self.world_from_box[len(self.world_from_box) // 2].double()
+
     def is_present(self, timestamp_ns: int, margin_ns: int = PRESENCE_MARGIN_NS) -> bool:
         """Whether the actor is there at a time; see `TrackPoses.present`."""
         return bool(TrackPoses.of([self]).present(timestamp_ns, margin_ns)[0])

@@ -10,7 +10,7 @@ from gaussian_world import FRAME_NS, camera_at, map_points, round_gaussians
 from parked_world import clip
 
 from lidarpainter_models.assets.asset_files import ABOUT_FILE, ORIGIN_FILE, read_asset
-from lidarpainter_models.assets.completion import GUESSED, MIRRORED, ORIGINS, SEEN, completed
+from lidarpainter_models.assets.completion import completed
 from lidarpainter_models.assets.expected_quality import (
     COEFFICIENTS_DB,
     EVIDENCE,
@@ -23,17 +23,22 @@ from lidarpainter_models.assets.extraction import write_assets
 from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SeenSurface
 from lidarpainter_models.assets.sighted_actors import RecordedLook, ShownImage, sighted_actors
 from lidarpainter_models.assets.sightings import Look, Sighting
-from lidarpainter_models.assets.vehicle_shapes import BUNDLED, MATERIALS, fitted_shape
 from lidarpainter_models.assets.whole_actors import (
     BEYOND,
     SIGMAS,
-    is_shaped,
     kept_in_box,
     surfaces_of,
     whole_actor,
 )
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.lidar.vehicle_colours import GUESSED, MIRRORED, ORIGINS, SEEN
+from lidarpainter_models.lidar.vehicle_shapes import (
+    BUNDLED,
+    MATERIALS,
+    fitted_shape,
+    has_known_shape,
+)
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.storage.tensor_files import read_tensors
 
@@ -234,5 +239,5 @@ def test_a_box_that_no_vehicle_fills_is_left_alone():
         )
         for size_m in ([4.2, 0.01, 1.5], [4.2, 1.8, 1.5])
     )
-    assert not is_shaped(flat)
-    assert is_shaped(car)
+    assert not has_known_shape(flat)
+    assert has_known_shape(car)

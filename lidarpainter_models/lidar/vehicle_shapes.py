@@ -15,8 +15,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.scenes.categories import category_of
+from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.storage.tensor_files import read_tensors
 
+SHAPED = ("car", "van", "pickup", "vehicle")
+"""Categories whose shapes are known."""
+SHAPED_M = ((3.0, 6.2), (1.2, 2.8), (1.2, 2.8))
+"""Least and most length, width and height of boxes whose shapes are known: what a data set calls a
+vehicle may be a bus."""
 BUNDLED = Path(__file__).parent / "bundled" / "vehicle_shapes.safetensors"
 GRID = (48, 12, 20)
 """Nodes along x, |y| and z."""
@@ -44,6 +51,13 @@ EVIDENCE = 300.0
 """Points are worth so many independent ones together: neighbours say the same."""
 _SHIFT_M, _YAW_RAD, _STRETCH = 0.06, 0.02, 0.03
 """Deviations of the shape's frame from the box."""
+
+
+def has_known_shape(track: ActorTrack) -> bool:
+    """Whether the shape of an actor is one that is known."""
+    sides = zip(track.size_m.tolist(), SHAPED_M, strict=True)
+    has_size = all(least <= side <= most for side, (least, most) in sides)
+    return category_of(track.category) in SHAPED and has_size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
