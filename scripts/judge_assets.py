@@ -28,8 +28,8 @@ from catalog.store import Store, open_store
 from flows.assets import publish_run
 from lidarpainter_models.assets.asset_files import ABOUT_FILE, read_asset
 from lidarpainter_models.assets.expected_quality import directions
-from lidarpainter_models.assets.extraction import BACKGROUND, camera_around
 from lidarpainter_models.assets.sightings import box_view
+from lidarpainter_models.assets.turntables import BACKGROUND, camera_around
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -96,9 +96,11 @@ def iou(one: Bool[Tensor, "height width"], other: Bool[Tensor, "height width"]) 
     return float((one & other).sum() / (one | other).sum().clamp(min=1))
 
 
-def psnr_db(rgb: Float[Tensor, "height width 3"], true: LoneImage) -> float:
-    """Of the pixels that the true actor covers."""
+def psnr_db(rgb: Float[Tensor, "height width 3"], true: LoneImage) -> float | None:
+    """Of the pixels that the true actor covers; None where it covers none."""
     inside = true.is_covered
+    if not bool(inside.any()):
+        return None
     return psnr_from_error(max(float((rgb[inside] - true.rgb[inside]).square().mean()), 1e-10))
 
 
@@ -141,11 +143,11 @@ def judge_run(store: Store, name: str, sheet: Path | None) -> Iterator[Line]:
         kept |= {"scene_id": run.scene_id, "car": f"{run.scene_id} {record['actor_id']}"}
         known = about.get("evidence", [None] * len(found))
         for (line, _), evidence in zip(found, known, strict=True):
-            kept["evidence"] = evidence
-            yield {**kept, "run_id": run.run_id, **line}
+            if line["psnr_db"] is not None:
+                yield {**kept, "evidence": evidence, "run_id": run.run_id, **line}
         if sheet is not None:
             write_png(
-                _pictures(truths, [rgb for _, rgb in found]),
+                picture_rows(truths, [[rgb for _, rgb in found]]),
                 sheet / run.run_id / f"{record['actor_id']}.png",
             )
 
@@ -168,14 +170,14 @@ def chosen(records: list[Line]) -> list[Line]:
     return vehicles[:MOST_OF_RUN]
 
 
-def _pictures(
-    truths: list[LoneImage], rgbs: list[Float[Tensor, "height width 3"]]
+def picture_rows(
+    truths: list[LoneImage], found: list[list[Float[Tensor, "height width 3"]]]
 ) -> Float[Tensor, "rows columns 3"]:
-    """Truth above, asset below, every other azimuth."""
+    """Truth above, what was made of it below, row by row; every other azimuth."""
     grey = torch.tensor(BACKGROUND)
     above = [torch.where(one.is_covered[..., None], one.rgb, grey) for one in truths]
     picked = range(0, len(truths), 2)
-    strips = [torch.cat([many[one] for one in picked], dim=1) for many in (above, rgbs)]
+    strips = [torch.cat([many[one] for one in picked], dim=1) for many in (above, *found)]
     return torch.cat(strips, dim=0)
 
 

@@ -64,6 +64,10 @@ class WholeActor:
         counts = torch.bincount(self.origin, minlength=len(ORIGINS)) / max(1, len(self.origin))
         return dict(zip(ORIGINS, counts.tolist(), strict=True))
 
+    def exposed_like(self, road_rgb: Float[Tensor, "3"]) -> "WholeActor":
+        """The same in the light of another scene, told by the colour of its road."""
+        return replace(self, model=self.model.exposed_like(road_rgb))
+
 
 def completed(model: ActorModel, surface: SeenSurface) -> WholeActor:
     """The vehicle of a model with its whole surface."""

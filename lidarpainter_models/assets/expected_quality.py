@@ -45,8 +45,15 @@ def directions() -> Float[Tensor, "directions 2"]:
     return torch.cartesian_prod(torch.tensor(ELEVATIONS_DEG).deg2rad(), azimuth).flip(1)
 
 
-def evidence_of(whole: WholeActor, sighting: Sighting) -> Float[Tensor, "directions evidence"]:
+def evidence_of(
+    whole: WholeActor,
+    sighting: Sighting,
+    like: Float[Tensor, "directions evidence"] | None = None,
+) -> Float[Tensor, "directions evidence"]:
     """What is known of each direction, by `EVIDENCE`.
+
+    `like` is the evidence of another sighting of the same vehicle: how much colours vary is taken
+    from there, since it grows with the exposure and the parts that were seen, not with the error.
 
     Raises:
         ValueError: the actor was not made whole.
@@ -67,7 +74,7 @@ def evidence_of(whole: WholeActor, sighting: Sighting) -> Float[Tensor, "directi
         math.log10(max(_LEAST_VARIANCE, float(surface.rgb[known].var(0).mean()))),
         math.log10(max(_LEAST_VARIANCE, float(spread))),
     ]
-    return torch.cat(
+    found = torch.cat(
         [
             torch.ones(len(to_eye), 1),
             torch.stack([facing @ (whole.origin == one).float() for one in (SEEN, MIRRORED)], 1),
@@ -76,6 +83,9 @@ def evidence_of(whole: WholeActor, sighting: Sighting) -> Float[Tensor, "directi
         ],
         dim=1,
     )
+    if like is not None:
+        found[:, -2:] = like[:, -2:]  # contrast and disagreement
+    return found
 
 
 def expected_psnr_db(

@@ -9,24 +9,23 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.assets.asset_files import write_asset
-from lidarpainter_models.assets.completion import WholeActor
-from lidarpainter_models.assets.expected_quality import (
-    directions,
-    evidence_of,
-    expected_psnr_db,
-    score_of,
-)
 from lidarpainter_models.assets.seen_surfaces import SeenSurface
+from lidarpainter_models.assets.sighted_vehicles import (
+    SIGHTED_FILE,
+    SightedVehicle,
+    write_sighted,
+)
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
+from lidarpainter_models.assets.turntables import THUMBNAIL_FILE, write_turntable
 from lidarpainter_models.assets.whole_actors import LEAST_GAUSSIANS, whole_actor
+from lidarpainter_models.assets.written_actors import Record, sized, write_actor
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -36,9 +35,6 @@ from lidarpainter_models.editing.actor_models import (
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.export.images import write_webp
-from lidarpainter_models.gaussians.model.drawing import draw_gaussians
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.lidar_map import MapPoints
@@ -46,18 +42,9 @@ from lidarpainter_models.scenes.actor_names import path_of_track
 from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.storage.tensor_files import write_tensors
 
-THUMBNAIL_FILE = "turntable.webp"
 SKY_FILE, WAYPOINTS_FILE = "sky.safetensors", "waypoints.csv"
 SKY_ROWS = 96
 """Rows of a sky's picture."""
-NUM_AZIMUTHS = 8
-"""Pictures of an asset on its turntable, side by side before plain grey."""
-WIDTH_PX, HEIGHT_PX = 128, 96
-BACKGROUND = 0.75
-_FOCAL_PX = 1.6 * WIDTH_PX
-
-Record = dict[str, Any]
-"""What is known of one asset; its names are those of the catalog's table `sightings`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,69 +97,31 @@ def _actors(source: AssetSource, output: Path) -> Iterator[Record]:
         seen = source.sighted[track.actor_id]
         if not seen.near_looks:
             continue
+        surface = source.surfaces.get(track.actor_id)
         try:
-            found = source.world.model_of(track)
+            found = source.world.model_of(track) if surface is None else surface.model
         except SceneError:
             continue  # nothing of it was fitted
         if len(found.gaussians) < LEAST_GAUSSIANS:
             continue
-        whole = whole_actor(found, source.surfaces.get(track.actor_id))
+        whole = whole_actor(found, surface)
         if len(whole.model.gaussians) < LEAST_GAUSSIANS:
             continue  # what was fitted lies outside its box
-        model = whole.model.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
         folder = f"actors/{number:03d}"
-        shares = {f"{name}_share": share for name, share in whole.shares.items()}
-        measured = _measured(seen, source.judged_on) | shares
-        expected = _expected(whole, seen)
-        measured["score"] = expected.get("score", seen.score)
-        looks = [[one.azimuth_deg, one.elevation_deg, one.distance_m] for one in seen.near_looks]
-        about = {**expected, **measured, "looks": looks}
-        write_asset(output / folder, model, about, origin=whole.origin)
+        neutral = whole.exposed_like(torch.tensor(NEUTRAL_ROAD_RGB))
+        written = write_actor(neutral, seen, output, folder, judged_on=source.judged_on)
+        if whole.surface is not None:
+            kept = SightedVehicle.of(whole.surface, seen)
+            write_sighted(output / folder / SIGHTED_FILE, kept)
         yield {
-            "kind": "actor",
+            **written,
             "category": track.category,
             "name": f"{track.category} {track.actor_id[:8]}",
             "actor_id": track.actor_id,
             "is_moving": track.is_moving,
-            **_sized(model),
-            **measured,
             **_when(track, source.world),
-            "folder": folder,
-            "thumbnail": _turned(output, folder, model, elevation_deg=15.0),
             "world_from_asset": as_moving(track, source.world.log).world_from_box[0].double(),
         }
-
-
-def _expected(whole: WholeActor, seen: Sighting) -> Record:
-    """Of a vehicle that was made whole, how right it is expected to look; else nothing."""
-    if whole.surface is None:
-        return {}
-    evidence = evidence_of(whole, seen)
-    psnr_db = expected_psnr_db(evidence)
-    return {
-        "score": score_of(psnr_db),
-        "directions_deg": torch.rad2deg(directions()).tolist(),
-        "expected_psnr_db": psnr_db.tolist(),
-        "evidence": evidence.tolist(),
-    }
-
-
-def _measured(seen: Sighting, judged_on: str) -> Record:
-    """The numbers of a sighting, as the catalog calls them."""
-    distances_m = torch.tensor([look.distance_m for look in seen.near_looks])
-    return {
-        "num_views": len(seen.near_looks),
-        "nearest_m": float(distances_m.min()),
-        "median_m": float(distances_m.median()),
-        "pixels_per_m": seen.pixels_per_m,
-        "sides": seen.sides,
-        "coverage": seen.coverage,
-        "sharpness": seen.sharpness,
-        "psnr_db": seen.psnr_db,
-        "judged_on": None if seen.psnr_db is None else judged_on,
-        "occlusion": seen.occlusion,
-        "score": seen.score,
-    }
 
 
 def _street(source: AssetSource, output: Path) -> Iterator[Record]:
@@ -195,10 +144,10 @@ def _street(source: AssetSource, output: Path) -> Iterator[Record]:
             "kind": "street",
             "category": "street",
             "name": f"street {block.number:+d}",
-            **_sized(model),
+            **sized(model),
             **_when(None, source.world),
             "folder": folder,
-            "thumbnail": _turned(output, folder, model, elevation_deg=35.0),
+            "thumbnail": write_turntable(output, folder, model, elevation_deg=35.0),
             "world_from_asset": block.world_from_block,
         }
 
@@ -261,61 +210,8 @@ def _trajectory(output: Path, number: int, category: str, path: DrivenPath) -> R
     }
 
 
-def _turned(output: Path, folder: str, model: ActorModel, *, elevation_deg: float) -> str:
-    """Write the turntable of a model; its name in the artefact."""
-    strip = turntable(model.gaussians, model.size_m, elevation_deg=elevation_deg)
-    write_webp(strip, output / folder / THUMBNAIL_FILE)
-    return f"{folder}/{THUMBNAIL_FILE}"
-
-
-def _sized(model: ActorModel) -> Record:
-    length_m, width_m, height_m = model.size_m.tolist()
-    return {
-        "length_m": length_m,
-        "width_m": width_m,
-        "height_m": height_m,
-        "num_gaussians": len(model.gaussians),
-        "num_points": len(model.points),
-    }
-
-
 def _when(track: ActorTrack | None, world: EditedWorld) -> Record:
     """First and last time of a track, or of the log."""
     times_ns = world.log.ego.timestamps_ns if track is None else track.timestamps_ns
     first_s, last_s = ((int(times_ns[end]) - world.log.start_ns) * 1e-9 for end in (0, -1))
     return {"first_s": first_s, "last_s": last_s}
-
-
-def turntable(
-    gaussians: GaussianSet, size_m: Float[Tensor, "3"], *, elevation_deg: float = 15.0
-) -> Float[Tensor, "height width 3"]:
-    """See Gaussians (of body 0, about the origin) from all sides, first from ahead (+x).
-
-    The azimuth grows to the left: ahead, ahead left, left, ... The camera is so far away that a
-    box of this size fits.
-    """
-    pictures = []
-    for number in range(NUM_AZIMUTHS):
-        azimuth = 2 * math.pi * number / NUM_AZIMUTHS
-        camera = camera_around(azimuth, math.radians(elevation_deg), size_m)
-        bodies = invert_rigid(camera.world_from_camera)[None].float()
-        with torch.no_grad():
-            image = draw_gaussians(gaussians, bodies, camera)
-        pictures.append(image.rgb.clamp(0, 1) + (1 - image.alpha)[..., None] * BACKGROUND)
-    return torch.cat(pictures, dim=1).clamp(0, 1)
-
-
-def camera_around(azimuth_rad: float, elevation_rad: float, size_m: Float[Tensor, "3"]) -> Camera:
-    """A camera that looks at the origin from so far away that a box of this size fits."""
-    distance_m = float(size_m.norm()) / 2 * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
-    flat = math.cos(elevation_rad)
-    away = torch.tensor(
-        [flat * math.cos(azimuth_rad), flat * math.sin(azimuth_rad), math.sin(elevation_rad)],
-        dtype=torch.float64,
-    )
-    right = torch.tensor([-math.sin(azimuth_rad), math.cos(azimuth_rad), 0.0]).double()
-    down = torch.linalg.cross(-away, right)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, down, -away], dim=1)
-    pose[:3, 3] = distance_m * away
-    return Camera.centred(pose, _FOCAL_PX, width_px=WIDTH_PX, height_px=HEIGHT_PX)

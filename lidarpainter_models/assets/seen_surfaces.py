@@ -13,7 +13,7 @@ from lidarpainter_models.editing.actor_models import OPAQUE, ActorModel
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.lidar.vehicle_colours import VehiclePlaces
-from lidarpainter_models.lidar.vehicle_shapes import VehicleShape, fitted_shape
+from lidarpainter_models.lidar.vehicle_shapes import MeasuredPoints, VehicleShape, fitted_shape
 
 SPACING_M = 0.06
 """Between places on the surface: as fine as 17 pixels a metre show."""
@@ -35,6 +35,8 @@ OUTSIDE = 1.02
 class SeenSurface:
     """Places on the surface of one vehicle, and what was seen of each."""
 
+    model: ActorModel
+    """Whose surface it is, as it was fitted."""
     shape: VehicleShape
     places: Float[Tensor, "places 3"]
     normals: Float[Tensor, "places 3"]
@@ -47,16 +49,15 @@ class SeenSurface:
     @classmethod
     def of(cls, model: ActorModel) -> "SeenSurface":
         """The surface that fits the LiDAR points and opaque Gaussians of a model."""
-        own = model.gaussians
-        is_told = (own.opacity > OPAQUE) & (own.scale_m.amax(1) < WIDEST_M)
-        measured = model.points.measured()
-        points = torch.cat([measured.xyz_m, own.means.detach()[is_told]])
-        weight = torch.ones(len(points))
-        weight[len(measured) :] = GAUSSIAN_WEIGHT
-        inside = (points.abs() <= OUTSIDE * model.size_m / 2).all(dim=1)
-        shape = fitted_shape(points[inside], weight[inside], model.size_m)
+        told = measured_points(model)
+        return cls.unseen(model, fitted_shape(told.points_box, told.weight, model.size_m))
+
+    @classmethod
+    def unseen(cls, model: ActorModel, shape: VehicleShape) -> "SeenSurface":
+        """The surface of a shape, before anything is seen of it."""
         places, normals = shape.surface(SPACING_M)
         return cls(
+            model=model,
             shape=shape,
             places=places,
             normals=normals,
@@ -134,3 +135,15 @@ class SeenSurface:
         """Variance of the colours that looks show of a place, the mean of the channels."""
         mean_square = self.square_sum / self.weight.clamp(min=1e-6)
         return (mean_square - self.rgb.square().mean(1)).clamp(min=0)
+
+
+def measured_points(model: ActorModel) -> MeasuredPoints:
+    """The LiDAR points and opaque Gaussians of a model inside its box."""
+    own = model.gaussians
+    is_told = (own.opacity > OPAQUE) & (own.scale_m.amax(1) < WIDEST_M)
+    measured = model.points.measured()
+    points = torch.cat([measured.xyz_m, own.means.detach()[is_told]])
+    weight = torch.ones(len(points))
+    weight[len(measured) :] = GAUSSIAN_WEIGHT
+    inside = (points.abs() <= OUTSIDE * model.size_m / 2).all(dim=1)
+    return MeasuredPoints(points[inside], weight[inside])

@@ -7,6 +7,7 @@ one side, by slabs (Kay and Kajiya, 1986).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -192,6 +193,19 @@ class Sighting:
         self.gradient += float(gradient[row, column].double().sum())
         self.true_gradient += float(true_gradient[row, column].double().sum())
         self.num_judged += len(row)
+
+    @classmethod
+    def of_all(cls, sightings: Sequence["Sighting"]) -> "Sighting":
+        """What several runs show of one actor together."""
+        return cls(
+            looks=[look for one in sightings for look in one.looks],
+            cells=torch.stack([one.cells for one in sightings]).any(dim=0),
+            pixels_per_m=max(one.pixels_per_m for one in sightings),
+            squared_error=sum(one.squared_error for one in sightings),
+            num_judged=sum(one.num_judged for one in sightings),
+            gradient=sum(one.gradient for one in sightings),
+            true_gradient=sum(one.true_gradient for one in sightings),
+        )
 
     @property
     def near_looks(self) -> list[Look]:

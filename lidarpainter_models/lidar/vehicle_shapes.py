@@ -7,6 +7,7 @@ signed distances; a latent number of 1 is one standard deviation.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -97,6 +98,16 @@ class VehicleShape:
     def _own(self, points_box: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
         """Points in the frame of the shape."""
         return (points_box - self.centre_m) @ self._box_from_own
+
+    def rotation_to(self, other: "VehicleShape") -> Float[Tensor, "3 3"]:
+        """Turns directions in this box into those in the box where the same vehicle is `other`."""
+        return other._box_from_own @ self._box_from_own.T
+
+    def carried_to(
+        self, other: "VehicleShape", points_box: Float[Tensor, "points 3"]
+    ) -> Float[Tensor, "points 3"]:
+        """Places on this vehicle, in the frame of the box where the same vehicle is `other`."""
+        return (points_box - self.centre_m) @ self.rotation_to(other).T + other.centre_m
 
     def surface(
         self, spacing_m: float
@@ -202,6 +213,20 @@ def _bundled() -> _Model:
     return _Model(tensors["mean_m"].float(), tensors["axes_m"].float(), shares)
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredPoints:
+    """What was measured of one vehicle in one box, and of what is around it there."""
+
+    points_box: Float[Tensor, "points 3"]
+    weight: Float[Tensor, " points"]
+    """What each says of the surface, against a point of LiDAR."""
+
+    def thinned(self) -> "MeasuredPoints":
+        """At most `MOST_POINTS` of them, evenly taken: as many as a fit looks at."""
+        step = max(1, -(-len(self.weight) // MOST_POINTS))
+        return MeasuredPoints(self.points_box[::step], self.weight[::step])
+
+
 def fitted_shape(
     points_box: Float[Tensor, "points 3"],
     weight: Float[Tensor, " points"],
@@ -212,27 +237,38 @@ def fitted_shape(
     Minimises weighted robust distances and the negative logarithm of the prior over latent numbers,
     place, heading and size of the shape. Without points it is the mean of vehicles in this box.
     """
+    return fitted_shapes([MeasuredPoints(points_box, weight)], size_m)[0]
+
+
+def fitted_shapes(
+    measured: Sequence[MeasuredPoints], size_m: Float[Tensor, "3"]
+) -> list[VehicleShape]:
+    """One vehicle that was measured in several boxes, as it stands in each of them.
+
+    Form and size are those of one rigid vehicle; place and heading in a box are its own, since
+    boxes of one car differ by centimetres. `size_m` is of the first box.
+    """
     model = _bundled()
     latent = torch.zeros(len(model.axes_m), requires_grad=True)
-    frame = torch.zeros(7, requires_grad=True)
-    if len(points_box) >= LEAST_POINTS:
-        rows = _thinned(len(points_box))
-        points, weight = points_box[rows], weight[rows] / weight[rows].sum() * EVIDENCE
-        optimiser = torch.optim.Adam([latent, frame], lr=0.1)
-        for _ in range(STEPS):
-            optimiser.zero_grad()
-            shape = model.shaped(latent, frame, size_m)
+    places = torch.zeros(len(measured), 4, requires_grad=True)
+    stretch = torch.zeros(3, requires_grad=True)
+    told = []
+    for row, one in enumerate(measured):
+        if len(one.weight) >= LEAST_POINTS:
+            few = one.thinned()
+            told.append((row, few.points_box, few.weight / few.weight.sum() * EVIDENCE))
+    optimiser = torch.optim.Adam([latent, places, stretch], lr=0.1)
+    for _ in range(STEPS if told else 0):
+        optimiser.zero_grad()
+        loss = 0.5 * torch.cat([latent, places.flatten(), stretch]).square().sum()
+        for row, points, weight in told:
+            shape = model.shaped(latent, torch.cat([places[row], stretch]), size_m)
             ratio = (shape.signed_distance(points) / OUTLIER_M).square()
-            loss = (weight * ratio / (1 + ratio)).sum()
-            loss = loss + 0.5 * (latent.square().sum() + frame.square().sum())
-            loss.backward()
-            optimiser.step()
+            loss = loss + (weight * ratio / (1 + ratio)).sum()
+        loss.backward()
+        optimiser.step()
     with torch.no_grad():
-        return model.shaped(latent.detach(), frame.detach(), size_m)
-
-
-def _thinned(count: int) -> Tensor:
-    return torch.arange(0, count, max(1, -(-count // MOST_POINTS)))
+        return [model.shaped(latent, torch.cat([place, stretch]), size_m) for place in places]
 
 
 def _sampled(

@@ -12,10 +12,10 @@ from catalog.digests import canonical_json, digest_text
 from catalog.schemas import SIGHTINGS
 from catalog.store import Store
 from lidarpainter_models.assets.asset_files import write_asset
-from lidarpainter_models.assets.extraction import THUMBNAIL_FILE, turntable
 from lidarpainter_models.assets.foreign_files import ForeignFolder, ForeignShape
 from lidarpainter_models.assets.import_formats import import_format
 from lidarpainter_models.assets.placing import Placement, placed_actor
+from lidarpainter_models.assets.turntables import THUMBNAIL_FILE, turntable
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.export.images import write_webp
 from tasks.assets.enter import is_same, sighting

@@ -61,13 +61,14 @@ def _build(
     world = opened_world(this.store, finished)
     final = load_scene(this.store, finished.final.gaussians)
     looks = _looks(this, world, observation, final)
-    surfaces = surfaces_of(world)
+    middle_ns = (world.log.start_ns + world.log.end_ns) // 2
+    shown = replace(world, scene=final.baked(middle_ns))
+    surfaces = surfaces_of(shown)
     sighted = sighted_actors(
         world, looks, lambda done, total: progress(done, total, "seen"), surfaces
     )
-    middle_ns = (world.log.start_ns + world.log.end_ns) // 2
     source = AssetSource(
-        world=replace(world, scene=final.baked(middle_ns)),
+        world=shown,
         sighted=sighted,
         surfaces=surfaces,
         judged_on="held-out" if this.views.test else "training",

@@ -10,15 +10,9 @@ from gaussian_world import round_gaussians
 from parked_world import PARKED, RED, SIZE_M, clip
 
 from lidarpainter_models.assets.asset_files import ABOUT_FILE, ORIGIN_FILE, read_asset
-from lidarpainter_models.assets.extraction import (
-    HEIGHT_PX,
-    NUM_AZIMUTHS,
-    WAYPOINTS_FILE,
-    WIDTH_PX,
-    turntable,
-    write_assets,
-)
+from lidarpainter_models.assets.extraction import WAYPOINTS_FILE, write_assets
 from lidarpainter_models.assets.street_blocks import BLOCK_M, street_blocks
+from lidarpainter_models.assets.turntables import HEIGHT_PX, NUM_AZIMUTHS, WIDTH_PX, turntable
 from lidarpainter_models.editing.actor_models import NEUTRAL_ROAD_RGB
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.gaussians.model.placing import carried_gaussians

@@ -20,9 +20,9 @@ from foreign_cars import (
 from PIL import Image
 
 from lidarpainter_models.assets import foreign_files, foreign_meshes, foreign_usd, surface_gaussians
-from lidarpainter_models.assets.extraction import BACKGROUND, WIDTH_PX, turntable
 from lidarpainter_models.assets.foreign_files import ForeignFolder
 from lidarpainter_models.assets.import_formats import IMPORT_FORMATS, import_format
+from lidarpainter_models.assets.turntables import BACKGROUND, WIDTH_PX, turntable
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.export.spz_files import write_spz
 from lidarpainter_models.gaussians.model.ply_files import write_ply

@@ -1,0 +1,158 @@
+"""Vehicles fused from several sightings, against a shape and colours that are known."""
+
+import math
+
+import pytest
+import torch
+from gaussian_world import map_points, round_gaussians
+
+from lidarpainter_models.assets.completion import SEEN, completed
+from lidarpainter_models.assets.expected_quality import evidence_of, expected_psnr_db
+from lidarpainter_models.assets.fusion import compared, fused_vehicle
+from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SeenSurface
+from lidarpainter_models.assets.sighted_vehicles import (
+    SightedVehicle,
+    read_sighted,
+    write_sighted,
+)
+from lidarpainter_models.assets.sightings import Look, Sighting
+from lidarpainter_models.assets.vehicle_shapes import fitted_shape
+from lidarpainter_models.editing.actor_models import ActorModel
+from lidarpainter_models.errors import DataError
+
+SIZE_M = torch.tensor([4.7, 1.98, 1.45])
+AHEAD_M = torch.tensor([0.08, -0.05, 0.0])
+"""Where the second box stands in the first one."""
+
+
+def true_rgb(places):
+    """Red, darker towards the rear, with a stripe of white over the bonnet."""
+    shade = 0.35 + 0.08 * places[:, :1]
+    rgb = shade * torch.tensor([1.0, 0.3, 0.3])
+    rgb[places[:, 0] > 1.4] = torch.tensor([0.8, 0.8, 0.75])
+    return rgb
+
+
+def look(azimuth_deg):
+    return Look(
+        azimuth_deg=azimuth_deg,
+        elevation_deg=5.0,
+        distance_m=10.0,
+        num_pixels=5000,
+        hidden_share=0.1,
+    )
+
+
+def sighting(chosen, *, shift_m=(0.0, 0.0, 0.0), gain=(1.0, 1.0, 1.0), azimuth_deg=0.0, paint=None):
+    """What one run keeps of the true car, and how it publishes it.
+
+    `chosen` says which places (by true place and normal) its images show, and its LiDAR too; its
+    box stands elsewhere by `shift_m`, and it sees all colours multiplied by `gain`.
+    """
+    shape = fitted_shape(torch.zeros(0, 3), torch.zeros(0), SIZE_M)
+    places, normals = shape.surface(0.1)
+    points = places[chosen(places, normals)] - torch.tensor(shift_m)
+    model = ActorModel(
+        gaussians=round_gaussians(torch.zeros(1, 3), torch.full((1, 3), 0.5), sigma_m=0.05),
+        points=map_points(points, torch.full_like(points, 0.5)),
+        size_m=SIZE_M,
+        category="car",
+    )
+    surface = SeenSurface.of(model)
+    there = surface.places + torch.tensor(shift_m)
+    rows = chosen(there, surface.normals)
+    rgb = (true_rgb if paint is None else paint)(there) * torch.tensor(gain)
+    surface.weight[rows] = 4 * LEAST_WEIGHT
+    surface.rgb_sum[rows] = 4 * LEAST_WEIGHT * rgb[rows]
+    surface.square_sum[rows] = 4 * LEAST_WEIGHT * rgb[rows].square().mean(1)
+    seen = Sighting(looks=[look(azimuth_deg)], pixels_per_m=30.0)
+    return SightedVehicle.of(surface, seen), completed(model, surface)
+
+
+def front(places, normals):
+    return (normals[:, 0] > 0.5) | ((normals[:, 1] > 0.3) & (places[:, 0] > -1.2))
+
+
+def rear(places, normals):
+    return (normals[:, 0] < -0.5) | ((normals[:, 1] > 0.3) & (places[:, 0] < 0.9))
+
+
+def both_ends(**second):
+    sightings = [sighting(front), sighting(rear, azimuth_deg=180.0, **second)]
+    seen, whole = zip(*sightings, strict=True)
+    return seen, whole
+
+
+def fused_of(seen, whole, gains=None):
+    models = [one.model for one in whole]
+    given = torch.ones(len(seen), 3) if gains is None else torch.tensor(gains)
+    return fused_vehicle(seen, models, given)
+
+
+def error_of(whole, shift_m=(0.0, 0.0, 0.0)):
+    """RMS of its colours against the true car."""
+    there = whole.surface.places + torch.tensor(shift_m)
+    return float((whole.model.gaussians.base_rgb - true_rgb(there)).square().mean().sqrt())
+
+
+def test_a_fused_car_is_better_than_either_sighting():
+    shift_m = tuple(AHEAD_M.tolist())
+    seen, whole = both_ends(shift_m=shift_m)
+    fused = fused_of(seen, whole)
+    assert fused.taken == (0, 1)
+    alone = [error_of(whole[0]), error_of(whole[1], shift_m)]
+    assert error_of(fused.whole) < 0.7 * min(alone)
+    seen_share = [float((one.origin == SEEN).float().mean()) for one in (*whole, fused.whole)]
+    assert seen_share[2] > max(seen_share[:2]) + 0.05
+    assert {look.azimuth_deg for look in fused.sighting.looks} == {0.0, 180.0}
+
+
+def test_the_light_of_two_runs_is_compared_where_both_show_the_same():
+    seen, whole = both_ends(gain=(0.5, 0.6, 0.8))
+    itself, other = compared(seen, whole[0].model)
+    assert itself.log_ratio == (0.0, 0.0, 0.0)
+    assert other.num_places > 300
+    assert other.log_ratio == pytest.approx([-math.log(one) for one in (0.5, 0.6, 0.8)], abs=0.03)
+
+
+def test_with_its_gain_removed_a_darker_sighting_does_no_harm():
+    seen, whole = both_ends(gain=(0.5, 0.6, 0.8))
+    mended = fused_of(seen, whole, [[1.0, 1.0, 1.0], [1 / 0.5, 1 / 0.6, 1 / 0.8]])
+    plain = fused_of(*both_ends())
+    assert error_of(mended.whole) == pytest.approx(error_of(plain.whole), abs=0.005)
+
+
+def test_a_car_of_another_colour_in_the_same_place_is_left_out():
+    def blue(places):
+        return true_rgb(places).flip(1) * 0.5 + torch.tensor([0.0, 0.1, 0.5])
+
+    seen, whole = both_ends(paint=blue)
+    assert fused_of(seen, whole) is None
+    third, again = sighting(rear, azimuth_deg=180.0)
+    fused = fused_of((*seen, third), (*whole, again))
+    assert fused.taken == (0, 2)
+
+
+def test_what_is_kept_of_a_sighting_is_small_and_read_again(tmp_path):
+    kept, _ = sighting(front)
+    path = tmp_path / "sighted.safetensors"
+    write_sighted(path, kept)
+    assert path.stat().st_size < 150_000
+    again = read_sighted(path)
+    assert again.sighting.looks == kept.sighting.looks
+    for name in ("places", "normals", "rgb"):
+        assert torch.allclose(getattr(again, name), getattr(kept, name), atol=0.006)
+    assert torch.allclose(again.weight, kept.weight, rtol=0.01)
+    assert torch.allclose(again.measured.points_box, kept.measured.points_box, atol=0.003)
+    path.write_bytes(b"{}")
+    with pytest.raises(DataError, match="sighted"):
+        read_sighted(path)
+
+
+def test_more_looks_are_worth_more_whatever_parts_they_show():
+    seen, whole = both_ends()
+    fused = fused_of(seen, whole)
+    alone = evidence_of(whole[0], seen[0].sighting)
+    together = evidence_of(fused.whole, fused.sighting, alone)
+    assert torch.equal(together[:, -2:], alone[:, -2:])
+    assert float(expected_psnr_db(together).mean()) > float(expected_psnr_db(alone).mean())
