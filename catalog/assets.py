@@ -3,9 +3,12 @@
 An asset is all sightings of one thing. Its id is the least `occurrence_id` among them, so it
 follows from what was seen and not from who came first, and stays where a run is made anew. Its row
 takes the columns of the sighting with the best score. Both tables are written under one lock.
+
+What was fused from several sightings of an asset is a sighting of its own, whose `fused_from` names
+them. It serves if its score is the best, and goes when one of them goes.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +25,10 @@ LOCK = "assets"
 """Held by whoever writes: what is one asset is decided from all that is there."""
 LEAST_ID_LENGTH = 16
 """A track id of so many characters is given once, not counted anew in every sequence."""
+FUSED_KIND = "fused"
+"""Kind of the artefacts of what was fused."""
+MOST_FUSED = 8
+"""The best of a thing's sightings that are fused: more show nothing new."""
 NEAR_M = 10.0
 """Sightings farther apart along x or y are not compared: no car is so long."""
 
@@ -75,11 +82,66 @@ def forget_sightings(store: Store, column: str, values: Iterable[str]) -> None:
             return
         before = _stored(store, "asset_id", {row["asset_id"] for row in gone})
         names = {row["sighting_id"] for row in gone}
+        gone += [row for row in before if names & set(row["fused_from"] or ())]
+        names |= {row["sighting_id"] for row in gone}
         store.tables.delete(SIGHTINGS.name, "sighting_id", sorted(names))
         members, groups = _leaving(before, gone), _Groups()
         for row in members:
             groups.join(row["sighting_id"], row["asset_id"])
         _write(store, before, _named(members, groups))
+
+
+def to_fuse(store: Store, asset_ids: Iterable[str]) -> dict[str, list[Row]]:
+    """The sightings that may be fused, of those assets that have two or more, the best first."""
+    groups: dict[str, list[Row]] = {}
+    for row in _stored(store, "asset_id", asset_ids):
+        groups.setdefault(row["asset_id"], []).append(row)
+    chosen = {name: _to_fuse(rows) for name, rows in groups.items()}
+    return {name: rows for name, rows in chosen.items() if len(rows) > 1}
+
+
+def enter_fused(store: Store, made: Mapping[str, tuple[Sequence[Row], Row | None]]) -> list[str]:
+    """Enter what was fused in place of what stood; returns the assets of which something stands.
+
+    Args:
+        store: where.
+        made: by asset, the sightings as `to_fuse` gave them and the row of what was made of them,
+            all but its ids; None where they are not of one thing. Where the sightings are others
+            by now nothing is entered: whoever entered those fuses them.
+
+    Raises:
+        ConflictError: other writers won every attempt.
+        StorageError: a table cannot be written.
+    """
+    with store.alone(LOCK):
+        before = _stored(store, "asset_id", made)
+        entered: list[Row] = []
+        gone: list[Row] = []
+        for name, (members, row) in made.items():
+            own = [one for one in before if one["asset_id"] == name]
+            if _to_fuse(own) != list(members):
+                continue
+            if row is not None:
+                known = {column: row.get(column) for column in SIGHTINGS.arrow.names}
+                ids = {"asset_id": name, "sighting_id": digest_of("fused", name)}
+                entered.append(known | ids | {"occurrence_id": members[0]["occurrence_id"]})
+            gone += [one for one in own if one["fused_from"] is not None]
+        gone = _leaving(gone, entered)
+        store.tables.delete(SIGHTINGS.name, "sighting_id", [row["sighting_id"] for row in gone])
+        others = _leaving(_leaving(before, entered), gone)
+        _write(store, before, [*others, *entered])
+        return [row["asset_id"] for row in entered]
+
+
+def _to_fuse(rows: Sequence[Row]) -> list[Row]:
+    """The best sighting of each occurrence, the best first: two runs of a log show the same."""
+    ranked = sorted((row for row in rows if _may_be_fused(row)), key=how_well)
+    best = {row["occurrence_id"]: row for row in ranked}
+    return sorted(best.values(), key=how_well, reverse=True)[:MOST_FUSED]
+
+
+def _may_be_fused(row: Row) -> bool:
+    return row["kind"] == "actor" and row["seen_share"] is not None and row["fused_from"] is None
 
 
 def find_asset(store: Store, name: str) -> Row:
@@ -207,7 +269,7 @@ def _asset_row(members: Sequence[Row], base_of: dict[str, str]) -> Row:
     taken = {column.name: best.get(column.name) for column in ASSETS.columns}
     return taken | {
         "scene_ids": sorted({row["scene_id"] for row in members}),
-        "num_sightings": len(members),
+        "num_sightings": sum(row["fused_from"] is None for row in members),
         "derived_from": bases[0] if bases else None,
     }
 

@@ -3,7 +3,8 @@
 A run needs its scene, the artefacts that it lists, and the run that it was changed from. An
 artefact needs what it was made from. A sequence of a fleet needs its scene, its run and the styles
 of that which it asks for, a painter the artefact with its weights. An asset needs run and files of
-a sighting, the best, in each scene that shows it: its id follows from all of them.
+a sighting, the best, in each scene that shows it: its id follows from all of them; and what was
+fused from those. What was fused from others, before one was published anew, nobody needs.
 """
 
 from collections import defaultdict
@@ -13,7 +14,7 @@ from datetime import datetime
 from functools import cached_property
 
 from catalog.artefacts import ArtefactRef
-from catalog.assets import how_well
+from catalog.assets import FUSED_KIND, how_well
 from catalog.records import json_of
 from catalog.store import Store
 from catalog.tables import Row
@@ -55,10 +56,14 @@ class Needs:
 
     @cached_property
     def _sightings(self) -> Collection[Row]:
-        """The best sighting of everything that was seen in a scene."""
-        columns = ["sighting_id", "occurrence_id", "score", "run_id", "artefact_id"]
+        """The best sighting of everything that was seen in a scene, and what was fused."""
+        columns = ["sighting_id", "occurrence_id", "score", "seen_share", "fused_from"]
+        columns += ["run_id", "artefact_id"]
         rows = self._store.tables.arrow("sightings", columns=columns).to_pylist()
-        return {row["occurrence_id"]: row for row in sorted(rows, key=how_well)}.values()
+        return {
+            (row["occurrence_id"], row["fused_from"] is None): row
+            for row in sorted(rows, key=how_well)
+        }.values()
 
     @cached_property
     def _users(self) -> Mapping[str, set[str]]:
@@ -139,7 +144,9 @@ class Needs:
         kept = self.with_inputs(needed)
         foreign = self.listed(row["run_id"] for row in self.runs if row["run_id"] not in runs)
         foreign -= kept
-        kept |= self.made_from(kept) - foreign - self.made_from(foreign)
+        made = self.made_from(kept) - foreign - self.made_from(foreign)
+        replaced = {name for name in made if ArtefactRef.of_id(name).kind == FUSED_KIND}
+        kept |= made - replaced - self.made_from(replaced)
         scenes = {row["scene_id"] for row in self.runs if row["run_id"] in runs} | busy
         scenes |= {row["scene_id"] for row in self.wanted}
         contents = {digest for name in kept for digest in self._inputs.get(name, ())}

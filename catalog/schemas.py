@@ -294,6 +294,7 @@ _SIGHTED = (
     Column("num_bytes", "integer", "size of its files", "byte"),
     Column("created_at", "time", "when its files were made"),
     Column("software_version", "text", "version of lidarpainter"),
+    Column("fused_from", "texts", "sightings that it was fused from, or null: one alone"),
 )
 """What an asset takes over from its best sighting."""
 
@@ -304,14 +305,14 @@ ASSETS = TableSchema(
         Column("asset_id", "text", "least of the occurrence_id of its sightings"),
         *_SIGHTED,
         Column("scene_ids", "texts", "scenes that it was sighted in"),
-        Column("num_sightings", "integer", "rows of sightings"),
+        Column("num_sightings", "integer", "rows of sightings, without a fused one"),
         Column("derived_from", "text", "asset that it is a style of, or null"),
     ),
 )
 
 SIGHTINGS = TableSchema(
     "sightings",
-    "Every time that a run shows an asset: several may be of one car.",
+    "Every time that a run shows an asset: several may be of one car, and one fused from them.",
     (
         Column("sighting_id", "text", "digest of the run, the kind and the name in the run"),
         Column("asset_id", "text", "what was seen"),

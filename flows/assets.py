@@ -8,6 +8,7 @@ from flows.edit import EDIT
 from flows.parameters import view_parameters
 from lidarpainter_models.errors import ConfigError
 from tasks.assets.enter import enter_published
+from tasks.assets.fuse import fuse_sightings
 from tasks.assets.publish import publish_assets
 from tasks.editing.donors import PARKED
 from tasks.runs import FinishedRun, lineage, open_run
@@ -16,6 +17,7 @@ from tasks.runs import FinishedRun, lineage, open_run
 def publish_run(store: Store, run: str) -> dict[str, Any]:
     """Publish the street, the actors, the sky and the trajectories of a run.
 
+    Vehicles that other sequences show too are fused from all of their sightings.
     The same run again changes nothing.
 
     Returns:
@@ -35,6 +37,7 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
     parameters = view_parameters(finished)
     published = publish_assets(parameters.run_spec(store.address), finished, parameters.observation)
     ids = enter_published(store, finished, published, style)
+    fused = fuse_sightings(store, set(ids))
     counts = {name: count for name, count in published.summary.items() if name.startswith("num_")}
     return {
         "run_id": finished.run_id,
@@ -42,6 +45,7 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
         "style": style,
         **counts,
         "num_assets": len(set(ids)),
+        "num_fused": len(fused),
         "assets": ids,
         "artefact": str(store.artefacts.folder(published.ref)),
         "seconds": published.seconds,

@@ -203,9 +203,18 @@ def show(name: str, as_json: AsJson = False) -> None:
         return
     print_pairs(f"asset {asset['asset_id']}", {key: row_cell(key, asset[key]) for key in asset})
     columns = ("scene_id", "run_id", "actor_id", "num_views", "median_m", "sides", "score")
-    cells = [[row_cell(column, row[column]) for column in columns] for row in sightings]
-    print_table("sightings", columns, cells, num_text_columns=3)
+    alone = [row for row in sightings if row["fused_from"] is None]
+    cells = [[row_cell(column, row[column]) for column in columns] for row in alone]
+    print_table("sightings", columns, cells, _told_fusion(asset, sightings), num_text_columns=3)
     sys.stdout.write("\n".join(["made from", *told_explanation("", made, set())]) + "\n")
+
+
+def _told_fusion(asset: "Row", sightings: "list[Row]") -> str:
+    """What was fused from the sightings of an asset, and whether that serves."""
+    if asset["fused_from"]:
+        return f"fused from {len(asset['fused_from'])} sightings"
+    scores = [row["score"] for row in sightings if row["fused_from"]]
+    return f"the one fused from them is no better (score {scores[0]:.2f})" if scores else ""
 
 
 @app.command()

@@ -151,7 +151,8 @@ function open(asset) {
     "seen from": asset.sides?.join(", "), "directions seen": number(asset.coverage, 2), "of its surface": origins(asset), score: number(asset.score, 2),
     PSNR: number(asset.psnr_db, 1, " dB"), LPIPS: number(asset.lpips, 3), images: asset.num_views,
     Gaussians: asset.num_gaussians?.toLocaleString("en"), "LiDAR points": asset.num_points?.toLocaleString("en"),
-    sightings: asset.num_sightings, scenes: asset.scene_ids?.join(", "), dataset: asset.dataset, licence: asset.licence };
+    sightings: asset.num_sightings, "made of": asset.fused_from && `fused from ${asset.fused_from.length} sightings`,
+    scenes: asset.scene_ids?.join(", "), dataset: asset.dataset, licence: asset.licence };
   for (const [name, value] of Object.entries(facts)) {
     if (value == null || value === "" || value === "–") continue;
     const row = make("tr", "", null, table);

@@ -20,6 +20,7 @@ FIELDS = (
     *("scene_ids", "length_m", "width_m", "height_m", "sides", "coverage", "score"),
     *("seen_share", "mirrored_share", "guessed_share"),
     *("psnr_db", "lpips", "num_views", "num_points", "num_gaussians", "num_sightings"),
+    "fused_from",
 )
 """What the page knows of an asset; it may lack any but `asset_id` and `kind`."""
 PAGE, SCRIPT, DATA, PICTURES = "index.html", "gallery.js", "assets.js", "thumbnails"

@@ -4,7 +4,14 @@ from datetime import UTC, datetime
 
 import pytest
 
-from catalog.assets import digest_of, enter_sightings, find_asset, forget_sightings
+from catalog.assets import (
+    digest_of,
+    enter_fused,
+    enter_sightings,
+    find_asset,
+    forget_sightings,
+    to_fuse,
+)
 from catalog.errors import UnknownRecordError
 from catalog.store import open_store
 
@@ -163,3 +170,76 @@ def test_with_a_run_go_its_sightings_and_assets_that_nobody_else_saw(store):
     forget_sightings(store, "artefact_id", ["assets/two"])
     assert tables(store) == {"assets": [], "sightings": []}
     forget_sightings(store, "run_id", ["one"])
+
+
+def seen_twice(store):
+    """One whole car in two scenes; what is to be fused of it."""
+    rows = [
+        sighting("a", run="one", scene="toy/1", score=0.5, seen_share=0.3),
+        sighting("b", run="two", scene="toy/2", score=0.6, seen_share=0.2, place=0.1),
+    ]
+    entered(store, rows)
+    return to_fuse(store, {row["occurrence_id"] for row in rows})
+
+
+def fused(members, score=0.7, artefact="fused/ab"):
+    names = [row["sighting_id"] for row in members]
+    return members[0] | {"score": score, "artefact_id": artefact, "fused_from": names}
+
+
+def entered_fused(store, groups, **what):
+    return enter_fused(store, {name: (rows, fused(rows, **what)) for name, rows in groups.items()})
+
+
+@pytest.mark.parametrize(("score", "serves"), [(0.7, "fused/ab"), (0.55, "assets/two")])
+def test_what_was_fused_serves_if_it_is_better_than_every_sighting(store, score, serves):
+    groups = seen_twice(store)
+    assert entered_fused(store, groups, score=score) == list(groups)
+    (asset,) = tables(store)["assets"]
+    assert (asset["artefact_id"], asset["num_sightings"]) == (serves, 2)
+    assert asset["scene_ids"] == ["toy/1", "toy/2"]
+    assert (asset["fused_from"] is None) == (serves == "assets/two")
+
+
+def test_fused_again_nothing_changes(store):
+    groups = seen_twice(store)
+    entered_fused(store, groups)
+    before = tables(store)
+    versions = sorted(store.root.glob("tables/*/_delta_log/*.json"))
+    assert seen_twice(store) == groups
+    entered_fused(store, groups)
+    assert tables(store) == before
+    assert sorted(store.root.glob("tables/*/_delta_log/*.json")) == versions
+
+
+def test_with_a_sighting_goes_what_was_fused_from_it(store):
+    entered_fused(store, seen_twice(store))
+    forget_sightings(store, "run_id", ["one"])
+    found = tables(store)
+    assert [row["artefact_id"] for row in found["sightings"]] == ["assets/two"]
+    assert [row["artefact_id"] for row in found["assets"]] == ["assets/two"]
+    assert to_fuse(store, {found["assets"][0]["asset_id"]}) == {}
+
+
+def test_a_fused_one_of_other_sightings_is_replaced_and_never_entered_late(store):
+    early = seen_twice(store)
+    entered_fused(store, early)
+    third = sighting("c", run="three", scene="toy/3", score=0.4, seen_share=0.1, place=0.2)
+    entered(store, [third])
+    (name,) = {row["asset_id"] for row in tables(store)["sightings"]}
+    groups = to_fuse(store, {name})
+    assert [row["run_id"] for row in groups[name]] == ["two", "one", "three"]
+    entered_fused(store, groups, artefact="fused/abc")
+    assert entered_fused(store, early) == []  # somebody who was slower
+    (one,) = [row for row in tables(store)["sightings"] if row["fused_from"]]
+    assert (one["artefact_id"], len(one["fused_from"])) == ("fused/abc", 3)
+    enter_fused(store, {name: (groups[name], None)})  # they turn out to be of two things
+    assert not [row for row in tables(store)["sightings"] if row["fused_from"]]
+
+
+def test_of_two_runs_of_one_log_the_better_is_fused(store):
+    seen_twice(store)
+    again = sighting("a", run="again", scene="toy/1", score=0.8, seen_share=0.3)
+    entered(store, [again])
+    (rows,) = to_fuse(store, {row["asset_id"] for row in tables(store)["assets"]}).values()
+    assert [row["run_id"] for row in rows] == ["again", "two"]
