@@ -137,12 +137,17 @@ def _run(
 ) -> StageResult:
     """A stage that is made of sightings and what brings them into one light."""
     refs = [ArtefactRef.of_id(row["artefact_id"]) for row in rows]
+    part = "compared" if gains is None else "sighting"
     return run_stage(
         store,
         stage=stage,
         kind=FUSED_KIND,
-        inputs={f"sighting {number}": ref.digest for number, ref in enumerate(refs)},
-        config={"stage": stage, "folders": [row["folder"] for row in rows], "gains": gains},
+        inputs={
+            # other vehicles of the same runs are made from other parts
+            f"{part} {number} in {row['folder']}": ref.digest
+            for number, (row, ref) in enumerate(zip(rows, refs, strict=True))
+        },
+        config={"gains": gains},
         build=build,
     )
 
