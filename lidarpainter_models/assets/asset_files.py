@@ -2,7 +2,7 @@
 
 `gaussians.ply` and `points.safetensors` stand in the box frame (x along the length, y left, z up,
 origin at the centre; metres); `origin.safetensors` says of each Gaussian whether it was seen,
-mirrored or guessed (`completion.ORIGINS`); `asset.json` holds the rest.
+mirrored or guessed (`vehicle_colours.ORIGINS`); `asset.json` holds the rest.
 """
 
 import json

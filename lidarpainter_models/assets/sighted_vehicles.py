@@ -13,9 +13,9 @@ from torch import Tensor
 
 from lidarpainter_models.assets.seen_surfaces import SeenSurface, measured_points
 from lidarpainter_models.assets.sightings import Look, Sighting
-from lidarpainter_models.assets.vehicle_shapes import MeasuredPoints
 from lidarpainter_models.editing.actor_models import NEUTRAL_ROAD_RGB, exposure_gain
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.lidar.vehicle_shapes import MeasuredPoints
 from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 SIGHTED_FILE = "sighted.safetensors"

@@ -6,11 +6,11 @@ import pytest
 import torch
 from sighted_cars import front, rear, sighting, true_rgb
 
-from lidarpainter_models.assets.completion import SEEN
 from lidarpainter_models.assets.expected_quality import evidence_of, expected_psnr_db
 from lidarpainter_models.assets.fusion import compared, fused_vehicle
 from lidarpainter_models.assets.sighted_vehicles import read_sighted, write_sighted
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.lidar.vehicle_colours import SEEN
 
 SHIFT_M = (0.08, -0.05, 0.0)
 """Where the second box stands in the first one."""

@@ -7,8 +7,8 @@ from lidarpainter_models.assets.completion import completed
 from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SeenSurface
 from lidarpainter_models.assets.sighted_vehicles import SightedVehicle
 from lidarpainter_models.assets.sightings import Look, Sighting
-from lidarpainter_models.assets.vehicle_shapes import fitted_shape
 from lidarpainter_models.editing.actor_models import ActorModel
+from lidarpainter_models.lidar.vehicle_shapes import fitted_shape
 
 SIZE_M = torch.tensor([4.7, 1.98, 1.45])
 
