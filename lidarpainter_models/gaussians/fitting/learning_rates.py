@@ -38,6 +38,8 @@ class LearningRates:
     """Actors' angles; boxes are drawn by hand, and a degree off is common."""
     actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
     """Actors' positions; a decimetre off is common."""
+    actor_light: tuple[float, float] = (2e-2, 4e-3)
+    """Logarithms of actors' gains: from sun to shade a car loses half of its light."""
     bending_m: tuple[float, float] = (1e-2, 1e-3)
     """Nodes of the lattice that bends somebody who walks."""
     exposure: tuple[float, float] = (6e-3, 6e-4)

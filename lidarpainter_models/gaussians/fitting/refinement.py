@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
+from lidarpainter_models.gaussians.model.bending import knots_around
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 
 CAMERA_NOISE = {"rotation_rad": 2e-3, "translation_m": 0.03}
@@ -20,7 +21,8 @@ ACTOR_PRIOR = 1e-6
 """Weight of squared actor corrections, likewise: an actor fills a small part of the image."""
 ACTOR_SMOOTHNESS = 1e-5
 """Weight of squared jumps between an actor's neighbouring corrections, likewise."""
-
+LIGHT_PRIOR, LIGHT_SMOOTHNESS = 1e-5, 1e-4
+"""Weights of squared logarithms of actors' gains, and of their jumps between knots."""
 BEND_PRIOR = 3e-6
 """Weight of the squared strain of lattices (`Bending.strain`), likewise."""
 BEND_NOISE_M = 0.1
@@ -93,6 +95,7 @@ class Refinement:
         adams = {
             "camera_adam": RowAdam(scene.cameras.view_tangent),
             "actor_adam": RowAdam(scene.actors.tangent.flatten(0, 1)),
+            "light_adam": RowAdam(scene.actors.light.log_gain.flatten(1)),
             "bend_adam": RowAdam(scene.actors.bending.offset_m.flatten(1)),
             "exposure_adam": RowAdam(scene.exposure.matrix.flatten(1)),
             "gain_adam": RowAdam(scene.exposure.log_gain.view(-1, 1)),
@@ -150,6 +153,18 @@ class Refinement:
             return 0.0
         return BEND_PRIOR / BEND_NOISE_M**2 * self.scene.actors.bending.strain(timestamp_ns)
 
+    def light_prior(self, timestamp_ns: int) -> Float[Tensor, ""] | float:
+        """Light changes little, and slowly; lies where the Gaussians do."""
+        actors = self.scene.actors
+        if not actors.recorded_tracks:
+            return 0.0
+        now = actors.light.log_gain_at(timestamp_ns)
+        total = LIGHT_PRIOR * now.square().sum()
+        for neighbour in actors.knots_beside(timestamp_ns):
+            jump = now - actors.light.log_gain[neighbour].detach()
+            total = total + LIGHT_SMOOTHNESS * jump.square().sum()
+        return total
+
     def step(self, step: int, fraction: float, image: FitImage) -> None:
         """Move the corrections that are refined by the gradients they received; drop these.
 
@@ -167,6 +182,8 @@ class Refinement:
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
             if self._bends:
                 self._step_bending(fraction, image)
+        if self.scene.actors.recorded_tracks:
+            self._step_light(fraction, image)
         if self.refines_exposure:
             self._step_exposure(fraction, image)
         for table in self._tables():
@@ -184,6 +201,17 @@ class Refinement:
             table = bending.offset_m.view(len(bending.knots_ns), -1)
             gradient = _gradient(bending.offset_m).view(table.shape)
             self.adams["bend_adam"].step(table, gradient, table.new_full((1,), rate), near)
+
+    def _step_light(self, fraction: float, image: FitImage) -> None:
+        """Move the gains at the knots around an image; what all knots share is colour."""
+        light = self.scene.actors.light
+        before, after, _ = knots_around(light.knots_ns, image.timestamp_ns)
+        rate = self.config.learning_rates.at("actor_light", fraction)
+        with torch.no_grad():
+            table, gradient = light.log_gain.flatten(1), _gradient(light.log_gain).flatten(1)
+            rows = slice(before, after + 1)
+            self.adams["light_adam"].step(table, gradient, table.new_full((1,), rate), rows)
+            light.log_gain.sub_(light.log_gain.mean(dim=0))
 
     def _step_exposure(self, fraction: float, image: FitImage) -> None:
         exposure = self.scene.exposure
@@ -231,6 +259,7 @@ class Refinement:
             scene.cameras.view_tangent,
             scene.actors.tangent,
             scene.actors.bending.offset_m,
+            scene.actors.light.log_gain,
             exposure.matrix,
             exposure.log_gain,
         )

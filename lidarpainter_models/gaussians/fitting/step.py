@@ -112,6 +112,7 @@ def _recorded_gradients(
     if with_actors:
         loss = loss + weights.actors * actor_loss(splat, posed)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
+    loss = loss + state.refinement.light_prior(image.timestamp_ns)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
     total = loss if probe is None else loss + probed(splat)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.actor_light import ActorLight
 from lidarpainter_models.gaussians.model.bending import Bending, knots_around
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
@@ -44,6 +45,8 @@ class Actors:
     knots_ns: Int[Tensor, " knots"]
     tangent: Float[Tensor, "actors knots 6"]
     """Changed in place by a fit."""
+    light: ActorLight
+    """How bright they are over time; its gains lie where the Gaussians do."""
     bending: Bending = field(default_factory=Bending.none)
     """How those bend that are not rigid; its offsets lie where the Gaussians do."""
     _recorded_at: dict[int, ActorPoses] = field(default_factory=dict, init=False, repr=False)
@@ -60,6 +63,7 @@ class Actors:
             recorded_tracks=tuple(tracks),
             knots_ns=knots,
             tangent=torch.zeros(len(tracks), knots.numel(), 6, dtype=torch.float64),
+            light=ActorLight.steady(len(tracks), knots),
             bending=Bending.none(
                 [row + 1 for row in bent], [tracks[row].size_m for row in bent], knots
             ),
@@ -67,7 +71,7 @@ class Actors:
 
     def to(self, device: torch.device) -> "Actors":
         """The same for Gaussians on another device; poses stay on the CPU."""
-        return replace(self, bending=self.bending.to(device))
+        return replace(self, bending=self.bending.to(device), light=self.light.to(device))
 
     def with_rigid(self, track: ActorTrack) -> "Actors":
         """The same and one more, who does not bend, as the last."""
@@ -76,6 +80,7 @@ class Actors:
             self,
             recorded_tracks=(*self.recorded_tracks, track),
             tangent=torch.cat([self.tangent, more]),
+            light=self.light.with_steady(),
         )
 
     def without(self, body: int) -> "Actors":
@@ -85,6 +90,7 @@ class Actors:
             self,
             recorded_tracks=tuple(self.recorded_tracks[row] for row in kept),
             tangent=self.tangent[kept],
+            light=self.light.kept(kept),
             bending=self.bending.without(body),
         )
 

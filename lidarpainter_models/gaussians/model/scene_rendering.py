@@ -38,11 +38,13 @@ def gaussians_at(
     """Gaussians of a scene at a time, each still in the frame of its own body.
 
     Differentiable in centres and colours. None is for what holds many moments and cannot change
-    Gaussians from one to the next: lamps are lit as on average, and nobody bends.
+    Gaussians from one to the next: lamps are lit as on average, actors have their mean light, and
+    nobody bends.
     """
     if timestamp_ns is None:
         return blinking.lit_on_average(gaussians)
-    return bent_at(blinking.lit(gaussians, timestamp_ns), actors, timestamp_ns)
+    lit = actors.light.lit(blinking.lit(gaussians, timestamp_ns), timestamp_ns)
+    return bent_at(lit, actors, timestamp_ns)
 
 
 def bent_at(gaussians: AnyGaussians, actors: Actors, timestamp_ns: int) -> AnyGaussians:
@@ -88,15 +90,16 @@ class PosedScene:
         )
 
     def held(self) -> "PosedScene":
-        """The same, but no gradient reaches poses and bending."""
-        bending = self.actors.bending
+        """The same, but no gradient reaches poses, bending and the light of actors."""
+        bending, light = self.actors.bending, self.actors.light
         still = replace(bending, offset_m=bending.offset_m.detach())
+        steady = replace(light, log_gain=light.log_gain.detach())
         world_from_actors, present = self.poses
         return replace(
             self,
             poses=(world_from_actors.detach(), present),
             bodies=self.bodies.detach(),
-            actors=replace(self.actors, bending=still),
+            actors=replace(self.actors, bending=still, light=steady),
         )
 
     def looks(self) -> list[View]:

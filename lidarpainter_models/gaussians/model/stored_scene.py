@@ -6,6 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.model.actor_light import ActorLight
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.bending import Bending
 from lidarpainter_models.gaussians.model.blinking import Blinking
@@ -18,6 +19,7 @@ from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
 from lidarpainter_models.scenes.camera_faults import faults_from_records
 from lidarpainter_models.scenes.ego_corrections import EgoCorrections
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
+from lidarpainter_models.scenes.tracks import ActorTrack
 from lidarpainter_models.storage.tensor_files import grouped
 
 SCHEMA = 1
@@ -42,6 +44,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "own_body": dict(cameras.own_bodies),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
         "bending": vars(scene.actors.bending),
+        "actor_light": {"log_gain": scene.actors.light.log_gain},
         "blinking": vars(scene.blinking),
         "exposure": {
             "matrix": scene.exposure.matrix,
@@ -84,11 +87,7 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
     try:
         return GaussianScene(
             gaussians=GaussianSet(**groups["gaussians"]),
-            actors=Actors(
-                recorded_tracks=tracks_from_arrays(groups["tracks"], metadata["tracks"]),
-                bending=Bending(**groups["bending"]) if "bending" in groups else Bending.none(),
-                **groups["actors"],
-            ),
+            actors=_actors(groups, tracks_from_arrays(groups["tracks"], metadata["tracks"])),
             sky=_sky(groups["sky"], SkyLayout(**metadata["sky_layout"])),
             cameras=CameraCorrections(
                 keys=tuple((int(frame), str(name)) for frame, name in metadata["view_keys"]),
@@ -135,3 +134,14 @@ def _sky(arrays: dict[str, Tensor], layout: SkyLayout) -> SkyTexture:
             first=arrays["first_moment"], second=arrays["second_moment"], visits=arrays["visits"]
         ),
     )
+
+
+def _actors(groups: dict[str, dict[str, Tensor]], tracks: tuple[ActorTrack, ...]) -> Actors:
+    """Actors; those of earlier software neither bend nor change their light."""
+    knots_ns = groups["actors"]["knots_ns"]
+    if "actor_light" in groups:
+        light = ActorLight(knots_ns=knots_ns, **groups["actor_light"])
+    else:
+        light = ActorLight.steady(len(tracks), knots_ns)
+    bending = Bending(**groups["bending"]) if "bending" in groups else Bending.none()
+    return Actors(recorded_tracks=tracks, bending=bending, light=light, **groups["actors"])
