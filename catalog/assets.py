@@ -106,8 +106,8 @@ def enter_fused(store: Store, made: Mapping[str, tuple[Sequence[Row], Row | None
     Args:
         store: where.
         made: by asset, the sightings as `to_fuse` gave them and the row of what was made of them,
-            all but its ids; None where they are not of one thing. Where the sightings are others
-            by now nothing is entered: whoever entered those fuses them.
+            all but the ids of sighting and asset; None where they are not of one thing. Where the
+            sightings are others by now nothing is entered: whoever entered those fuses them.
 
     Raises:
         ConflictError: other writers won every attempt.
@@ -124,7 +124,7 @@ def enter_fused(store: Store, made: Mapping[str, tuple[Sequence[Row], Row | None
             if row is not None:
                 known = {column: row.get(column) for column in SIGHTINGS.arrow.names}
                 ids = {"asset_id": name, "sighting_id": digest_of("fused", name)}
-                entered.append(known | ids | {"occurrence_id": members[0]["occurrence_id"]})
+                entered.append(known | ids)
             gone += [one for one in own if one["fused_from"] is not None]
         gone = _leaving(gone, entered)
         store.tables.delete(SIGHTINGS.name, "sighting_id", [row["sighting_id"] for row in gone])

@@ -2,8 +2,8 @@
 
 Box frame: x along the length, y left, z up, origin at the centre; metres. Boxes of one vehicle
 differ by centimetres from run to run; the fused one stands in the first sighting's. Colours are in
-neutral neutral
-exposure, which is told by the road of a run; roads differ, so each sighting has a gain of its own.
+neutral exposure, which is told by the road of a run; roads differ, so each sighting has a gain of
+its own.
 """
 
 from collections.abc import Sequence

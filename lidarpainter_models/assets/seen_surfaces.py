@@ -141,9 +141,8 @@ def measured_points(model: ActorModel) -> MeasuredPoints:
     """The LiDAR points and opaque Gaussians of a model inside its box."""
     own = model.gaussians
     is_told = (own.opacity > OPAQUE) & (own.scale_m.amax(1) < WIDEST_M)
-    measured = model.points.measured()
-    points = torch.cat([measured.xyz_m, own.means.detach()[is_told]])
+    points = torch.cat([model.points.xyz_m, own.means.detach()[is_told]])
     weight = torch.ones(len(points))
-    weight[len(measured) :] = GAUSSIAN_WEIGHT
+    weight[len(model.points) :] = GAUSSIAN_WEIGHT
     inside = (points.abs() <= OUTSIDE * model.size_m / 2).all(dim=1)
     return MeasuredPoints(points[inside], weight[inside])

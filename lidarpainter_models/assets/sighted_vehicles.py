@@ -4,6 +4,7 @@ Box frame: x along the length, y left, z up, origin at the centre; metres. Colou
 exposure. The file is small: only what was seen is in it, places and points to a millimetre or two.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -89,6 +90,7 @@ def read_sighted(path: Path) -> SightedVehicle:
     """
     tensors, header = read_tensors(path)
     try:
+        _check(tensors)
         looks = [Look(**dict(zip(Look.__slots__, one, strict=True))) for one in header["looks"]]
         seen = Sighting(
             looks=looks, cells=tensors.pop("cells").bool(), **{name: header[name] for name in SUMS}
@@ -105,3 +107,23 @@ def read_sighted(path: Path) -> SightedVehicle:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path}: expected what a run showed of a vehicle: {error!r}") from None
+
+
+def _check(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors of other shapes than `write_sighted` gives them, and numbers that are none.
+
+    Raises:
+        ValueError: they are so.
+        KeyError: one is missing.
+    """
+    points, places = tensors["points"].shape[:1], tensors["places"].shape[:1]
+    expected = {
+        "points": (*points, 3),
+        "point_weight": points,
+        **dict.fromkeys(("places", "normals", "rgb"), (*places, 3)),
+        **dict.fromkeys(("weight", "variance"), places),
+        "cells": (6, 4, 4),
+    }
+    for name, shape in expected.items():
+        if tensors[name].shape != shape or not bool(tensors[name].isfinite().all()):
+            raise ValueError(f"{name} of shape {tuple(tensors[name].shape)}, expected {shape}")

@@ -70,7 +70,7 @@ class EditedWorld:
     @cached_property
     def ground(self) -> GroundHeights:
         """The ground, from an even sample of the street."""
-        xyz_m = self.lidar_map.street.xyz_m
+        xyz_m = self.lidar_map.street.measured().xyz_m
         return GroundHeights(xyz_m[:: max(1, len(xyz_m) // _GROUND_SAMPLE)])
 
     @cached_property
@@ -108,7 +108,7 @@ class EditedWorld:
             points = replace(points, xyz_m=transform_points(pose.to(points.xyz_m), points.xyz_m))
         return ActorModel(
             gaussians=gaussians.of_body(0),
-            points=points,
+            points=points.measured(),
             size_m=track.size_m,
             category=track.category,
             road_rgb=self.road_rgb,

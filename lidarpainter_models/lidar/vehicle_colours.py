@@ -81,7 +81,7 @@ class VehiclePlaces:
         left = rgb[known] - own @ colours
         folded = self._folded()
         distance_m, nearest = cKDTree(folded[known].numpy()).query(
-            folded[~known].numpy(), NEIGHBOURS
+            folded[~known].numpy(), [*range(1, min(NEIGHBOURS, int(known.sum())) + 1)]
         )
         weight = torch.from_numpy(np.exp(-distance_m / LIKE_M)).float()[..., None]
         near = (weight * left[torch.from_numpy(nearest)]).mean(1)

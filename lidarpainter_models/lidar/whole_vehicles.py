@@ -2,17 +2,17 @@
 
 A camera beside the driven lane sees sides of vehicles that no image and no sweep showed, and would
 look through what stands there. The shape that fits a vehicle's points says where its surface goes
-on, and what images saw of it in which colours (`vehicle_colours`). Such points begin a fit, and
-guide what is painted; they are no measurement and do not judge. World: x forward, y left, z up; box
-frame: x along the length, y left, z up, origin at the centre; metres.
+on, and what images saw of it in which colours (`vehicle_colours`). Such points begin a fit and are
+shown to the painter; they are no measurement: `measured` leaves them out. World: x forward, y left,
+z up; box frame: x along the length, y left, z up, origin at the centre; metres.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -35,13 +35,15 @@ SPACING_M = 0.06
 INSET_M = 0.04
 """Guessed points lie so far inside the surface, lest they hide what was seen beside them."""
 MEASURED_M = 0.12
-"""A place nearer to a measured point needs no guess."""
+"""A place nearer to a point that an image saw needs no guess."""
 COLOUR_M, COLOURS = 0.15, 3
 """How far from a place, and how many, are the coloured points that tell its colour."""
 LEAST_COLOURED = 60
 """Of a vehicle with fewer coloured points the colours are unknown."""
 LEAST_SEEN = 0.05
 """So is that of one whose surface was seen to a smaller share."""
+LOWEST_NORMAL = -0.5
+"""What faces down by more is the underside."""
 OUTSIDE = 1.02
 """Of the half size: who is farther out is no part of the body."""
 DARKEST = 0.02
@@ -57,31 +59,25 @@ class _Vehicle:
     """In the box frame."""
     world_from_box: Float[Tensor, "4 4"] | None = None
     """Of one that is parked and part of the street."""
-    rows: Int[Tensor, " points"] | None = None
-    """Of these points among those of the street."""
 
 
 def with_whole_vehicles(lidar_map: LidarMap, tracks: Sequence[ActorTrack]) -> LidarMap:
-    """The map with points on the unseen sides of its vehicles, and colours on all of their points.
+    """The map with coloured points on the sides of its vehicles that no image saw.
 
     Vehicles of which too little was seen stay as they are. New points come last, with `NO_FRAME`
-    for their frame.
+    for their frame; what was measured stays as it was.
     """
     shaped = [track for track in tracks if has_known_shape(track)]
     vehicles = [*_moving(lidar_map, shaped), *_parked(lidar_map, shaped)]
-    street, guessed, actors = lidar_map.street, [], dict(lidar_map.actors)
-    rgb_u8, has_colour = street.rgb_u8.clone(), street.has_colour.clone()
-    for vehicle, made in zip(vehicles, side_by_side(_made_whole, vehicles), strict=True):
-        if made is None:
+    street, actors = [lidar_map.street], dict(lidar_map.actors)
+    for vehicle, guessed in zip(vehicles, side_by_side(_guessed, vehicles), strict=True):
+        if guessed is None:
             continue
-        own, new = made
         if vehicle.world_from_box is None:
-            actors[vehicle.track.actor_id] = MapPoints.concatenate([own, new])
+            actors[vehicle.track.actor_id] = MapPoints.concatenate([vehicle.points, guessed])
         else:
-            rgb_u8[vehicle.rows], has_colour[vehicle.rows] = own.rgb_u8, own.has_colour
-            guessed.append(new.moved(vehicle.world_from_box))
-    street = replace(street, rgb_u8=rgb_u8, has_colour=has_colour)
-    return LidarMap(street=MapPoints.concatenate([street, *guessed]), actors=actors)
+            street.append(guessed.moved(vehicle.world_from_box))
+    return LidarMap(street=MapPoints.concatenate(street), actors=actors)
 
 
 def _moving(lidar_map: LidarMap, tracks: Sequence[ActorTrack]) -> Iterator[_Vehicle]:
@@ -114,13 +110,13 @@ def _parked(lidar_map: LidarMap, tracks: Sequence[ActorTrack]) -> Iterator[_Vehi
     order = owner.argsort(stable=True)
     counts = torch.bincount(owner, minlength=len(parked)).tolist()
     for track, pose, rows in zip(parked, poses, held[order].split(counts), strict=True):
-        yield _Vehicle(track, street.keep(rows).moved(invert_rigid(pose)), pose, rows)
+        yield _Vehicle(track, street.keep(rows).moved(invert_rigid(pose)), pose)
 
 
-def _made_whole(vehicle: _Vehicle) -> tuple[MapPoints, MapPoints] | None:
-    """The points of a vehicle with their colours, and guessed ones; None where too little is known.
+def _guessed(vehicle: _Vehicle) -> MapPoints | None:
+    """Points where no image saw a vehicle, in its box frame; None where too little is known.
 
-    Both in the box frame.
+    None of them is its underside, which nobody looks at and which would pass for the ground.
     """
     track, points = vehicle.track, vehicle.points
     is_inside = (points.xyz_m.abs() <= OUTSIDE * track.size_m / 2).all(dim=1)
@@ -134,10 +130,11 @@ def _made_whole(vehicle: _Vehicle) -> tuple[MapPoints, MapPoints] | None:
         return None
     known = VehiclePlaces(shape=shape, places=places, normals=normals, rgb=rgb, is_seen=is_seen)
     rgb_u8 = (known.coloured()[0].clamp(DARKEST, 1) * 255).round().to(torch.uint8)
-    is_open = torch.from_numpy(_distance_m(places, body.xyz_m) > MEASURED_M)
-    return _with_colours(points, places, rgb_u8), _guessed_points(
-        (places - INSET_M * normals)[is_open], rgb_u8[is_open], body
-    )
+    coloured = body.keep(body.has_colour.nonzero()[:, 0])
+    is_open = torch.from_numpy(_distance_m(places, coloured.xyz_m) > MEASURED_M)
+    is_open &= normals[:, 2] > LOWEST_NORMAL
+    is_open &= places[:, 2] > ROAD_HEIGHT_M - track.size_m[2] / 2
+    return _guessed_points((places - INSET_M * normals)[is_open], rgb_u8[is_open], body)
 
 
 def _colours_near(
@@ -160,22 +157,6 @@ def _distance_m(places: Float[Tensor, "places 3"], others: Float[Tensor, "points
     """How far the nearest of some points is."""
     found, _ = cKDTree(others.numpy()).query(places.numpy())
     return np.asarray(found)
-
-
-def _with_colours(
-    points: MapPoints, places: Float[Tensor, "places 3"], rgb_u8: Tensor
-) -> MapPoints:
-    """Measured points; those that no image saw take the colour of the surface."""
-    bare = (~points.has_colour).nonzero()[:, 0]
-    distance_m, nearest = cKDTree(places.numpy()).query(
-        points.xyz_m[bare].numpy(), distance_upper_bound=COLOUR_M
-    )
-    is_near = torch.from_numpy(np.isfinite(distance_m))
-    told = bare[is_near]
-    own_rgb, has_colour = points.rgb_u8.clone(), points.has_colour.clone()
-    own_rgb[told] = rgb_u8[torch.from_numpy(nearest)[is_near]]
-    has_colour[told] = True
-    return replace(points, rgb_u8=own_rgb, has_colour=has_colour)
 
 
 def _guessed_points(xyz_m: Float[Tensor, "points 3"], rgb_u8: Tensor, body: MapPoints) -> MapPoints:

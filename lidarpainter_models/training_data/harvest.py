@@ -13,6 +13,7 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.lidar.map_building import build_lidar_map
+from lidarpainter_models.lidar.whole_vehicles import with_whole_vehicles
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -160,7 +161,7 @@ def _observations_of(
         split_frames=split.train_frames if plan.with_all_sweeps else plan.fit_frames,
         colour_views=recorded,
     )
-    return replace(aligned, views=views, lidar_map=lidar_map)
+    return replace(aligned, views=views, lidar_map=with_whole_vehicles(lidar_map, scene.tracks))
 
 
 def _target_name(label: str, key: ViewKey) -> str:

@@ -53,7 +53,10 @@ def fuse_sightings(store: Store, asset_ids: Iterable[str]) -> list[str]:
     groups = to_fuse(store, asset_ids)
     if not groups:
         return []
-    members = {name: [row for row in rows if _is_kept(store, row)] for name, rows in groups.items()}
+    members = {
+        name: [row for row in rows if _is_kept(store, row) and _heads_alike(rows[0], row)]
+        for name, rows in groups.items()
+    }
     light = _light(store, [rows for rows in members.values() if len(rows) > 1])
     made = {name: (rows, _fused(store, members[name], light)) for name, rows in groups.items()}
     return enter_fused(store, made)
@@ -156,6 +159,13 @@ def _is_kept(store: Store, row: Row) -> bool:
     """Whether a sighting was published with what fusing needs of it."""
     manifest = store.artefacts.manifest(ArtefactRef.of_id(row["artefact_id"]))
     return f"{row['folder']}/{SIGHTED_FILE}" in manifest.files
+
+
+def _heads_alike(one: Row, other: Row) -> bool:
+    """Whether the boxes of what stands in one frame do not head opposite ways."""
+    if one["is_moving"] or other["is_moving"] or one["frame"] != other["frame"]:
+        return True
+    return math.cos(one["heading_rad"] - other["heading_rad"]) > 0
 
 
 def _folder(store: Store, row: Row) -> Path:

@@ -69,7 +69,8 @@ def export_dataset(
     listener().started(STAGE)
     total = sum(len(path.views) for path in (*recorded, *beside))
     images: list[PosedImage] = []
-    points = map_sample(load_observations(this.store, viewed.fitted.observations).lidar_map.street)
+    street = load_observations(this.store, viewed.fitted.observations).lidar_map.street
+    points = map_sample(street.measured())
     with new_folder(out) as folder:
         for write, paths in ((_write_recorded, recorded), (_write_seen, beside)):
             for path in paths:

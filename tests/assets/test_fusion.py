@@ -11,6 +11,7 @@ from lidarpainter_models.assets.fusion import compared, fused_vehicle
 from lidarpainter_models.assets.sighted_vehicles import read_sighted, write_sighted
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.lidar.vehicle_colours import SEEN
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 SHIFT_M = (0.08, -0.05, 0.0)
 """Where the second box stands in the first one."""
@@ -82,6 +83,12 @@ def test_what_is_kept_of_a_sighting_is_small_and_read_again(tmp_path):
         assert torch.allclose(getattr(again, name), getattr(kept, name), atol=0.006)
     assert torch.allclose(again.weight, kept.weight, rtol=0.01)
     assert torch.allclose(again.measured.points_box, kept.measured.points_box, atol=0.003)
+    tensors, header = read_tensors(path)
+    for name, spoilt in (("normals", torch.zeros(3)), ("rgb", tensors["rgb"][:5]), ("cells", None)):
+        others = {key: value for key, value in tensors.items() if key != name}
+        write_tensors(path, others if spoilt is None else others | {name: spoilt}, header)
+        with pytest.raises(DataError, match=name):
+            read_sighted(path)
     path.write_bytes(b"{}")
     with pytest.raises(DataError, match="sighted"):
         read_sighted(path)

@@ -18,7 +18,7 @@ AT = torch.eye(4, dtype=torch.float64)
 AT[:3, 3] = torch.tensor([20.0, 5.0, float(SIZE_M[2]) / 2])
 PLACES, NORMALS = fitted_shape(torch.zeros(0, 3), torch.zeros(0), SIZE_M).surface(0.05)
 LEFT = (NORMALS[:, 1] > 0.3) | (NORMALS[:, 2] > 0.7)
-RIGHT = NORMALS[:, 1] < -0.35
+RIGHT = (NORMALS[:, 1] < -0.35) & (NORMALS[:, 2] > -0.4) & (PLACES[:, 2] > -0.6)
 
 
 def track(*, is_moving, category="car"):
@@ -72,15 +72,28 @@ def test_a_moving_car_gets_its_other_side_and_a_parked_one_the_same():
     assert float(torch.cdist(there, beside.xyz_m).amin(1).median()) < 0.05
 
 
-def test_what_was_measured_stays_where_it_was_and_takes_colours():
+def test_what_was_measured_stays_as_it_was():
     before = LidarMap(street=road(), actors={"one": seen_left()})
-    after = with_whole_vehicles(before, [track(is_moving=True)]).measured()
-    own = after.actors["one"]
-    assert torch.equal(own.xyz_m, seen_left().xyz_m)
-    assert bool(own.has_colour.all())
-    was = seen_left().has_colour
-    assert torch.equal(own.rgb_u8[was], seen_left().rgb_u8[was])
-    assert float(own.rgb_u8[~was][:, 0].float().mean()) > 60  # red, but for tyres, glass and lamps
+    after = with_whole_vehicles(before, [track(is_moving=True)])
+    own = after.measured().actors["one"]
+    for name, column in seen_left().to_arrays().items():
+        assert torch.equal(own.to_arrays()[name], column), name
+
+
+def test_where_no_image_saw_a_measured_side_its_colour_is_guessed():
+    before = LidarMap(street=road(), actors={"one": seen_left()})
+    after = with_whole_vehicles(before, [track(is_moving=True)]).actors["one"]
+    new = after.keep(after.frame_index == NO_FRAME)
+    rear_left = (new.xyz_m[:, 0] < -1.8) & (new.xyz_m[:, 1] > 0.6)
+    assert int(rear_left.sum()) > 20
+    assert bool(new.has_colour.all())
+
+
+def test_nothing_is_guessed_under_a_parked_car():
+    street = MapPoints.concatenate([road(), seen_left().moved(AT)])
+    after = with_whole_vehicles(LidarMap(street=street, actors={}), [track(is_moving=False)])
+    new = after.street.keep(after.street.frame_index == NO_FRAME)
+    assert float(new.xyz_m[:, 2].min()) > 0.04
 
 
 @pytest.mark.parametrize("case", ["pedestrian", "few", "colourless"])

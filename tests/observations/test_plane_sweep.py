@@ -1,7 +1,12 @@
 import torch
 from wall_images import image_of_wall, sideways_cameras
 
-from lidarpainter_models.observations.plane_sweep import choose_depth, sweep_cost, sweep_depths
+from lidarpainter_models.observations.plane_sweep import (
+    choose_depth,
+    depth_between,
+    sweep_cost,
+    sweep_depths,
+)
 
 
 def test_sweep_finds_the_depth_of_a_wall():
@@ -24,3 +29,9 @@ def test_without_texture_the_surroundings_decide():
     expected_m = torch.full((64, 96), 20.0)
     found = choose_depth(cost, depths_m, expected_m, prior=0.03)[20:-20, 30:-30]
     assert float((found - 20.0).abs().max()) < 3.0
+
+
+def test_what_is_farther_than_all_depths_stays_at_the_last():
+    depths_m = sweep_depths(4.0, 100.0, 25)
+    cost = torch.linspace(1, 0, 25)[:, None, None].expand(25, 3, 3)
+    assert torch.equal(depth_between(cost, cost.argmin(dim=0), depths_m), depths_m[-1].expand(3, 3))

@@ -116,6 +116,20 @@ def test_fit_gets_closer_to_the_images(world, undisturbed):
     assert undisturbed.history[-1]["step"] == STEPS
 
 
+def test_a_car_that_drives_into_the_shade_is_found_to_grow_dark(world):
+    views = list(world.observations.views)
+    for row in (2, 3):
+        shown = world.scene.render(views[row].camera, views[row].timestamp_ns)
+        share = torch.where(shown.actor_alpha > 0.5, 0.5, 1.0)[..., None]
+        dark = (views[row].rgb * share * 255).round().to(torch.uint8)
+        views[row] = replace(views[row], rgb_u8=dark)
+    seen = replace(world.observations, views=tuple(views))
+    gain = fit_gaussians(seen, short_fit(steps=120)).scene.actors.light.log_gain.detach().exp()
+    assert bool((gain[2:, 0] < 0.85 * gain[:2, 0]).all()), gain
+    steady = fit_gaussians(world.observations, short_fit(steps=120)).scene.actors.light.log_gain
+    assert float(steady.detach().abs().max()) < 0.15
+
+
 def test_budget_is_never_exceeded(undisturbed):
     numbers = [entry["num_gaussians"] for entry in undisturbed.history]
     assert max(numbers) <= 900
