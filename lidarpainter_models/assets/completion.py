@@ -9,16 +9,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.assets.seen_surfaces import SPACING_M, SeenSurface
+from lidarpainter_models.assets.seen_surfaces import SeenSurface
 from lidarpainter_models.editing.actor_models import DARKEST, ActorModel
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.lidar.vehicle_colours import ORIGINS
+from lidarpainter_models.lidar.vehicle_shapes import INSET_M, SPACING_M
 
 OPACITY = 0.95
 FLAT_M = 0.012
-INSET_M = 0.04
-"""Discs lie so far inside the surface: around bends they reach out of it."""
 WIDE = 0.6
 """Deviation of a flat Gaussian along the surface, in spacings."""
 

@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarpainter_models.assets.completion import WholeActor, completed
-from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SPACING_M, SeenSurface
+from lidarpainter_models.assets.seen_surfaces import LEAST_WEIGHT, SeenSurface
 from lidarpainter_models.assets.sighted_vehicles import SightedVehicle
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.editing.actor_models import DARKEST, ActorModel
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.vehicle_shapes import VehicleShape, fitted_shapes
+from lidarpainter_models.lidar.vehicle_shapes import SPACING_M, VehicleShape, fitted_shapes
 
 REACH_M = 1.5 * SPACING_M
 """A place takes the colour that a sighting gives the nearest one, up to so far away."""

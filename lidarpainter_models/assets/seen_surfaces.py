@@ -13,10 +13,14 @@ from lidarpainter_models.editing.actor_models import OPAQUE, ActorModel
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.lidar.vehicle_colours import VehiclePlaces
-from lidarpainter_models.lidar.vehicle_shapes import MeasuredPoints, VehicleShape, fitted_shape
+from lidarpainter_models.lidar.vehicle_shapes import (
+    OUTSIDE,
+    SPACING_M,
+    MeasuredPoints,
+    VehicleShape,
+    fitted_shape,
+)
 
-SPACING_M = 0.06
-"""Between places on the surface: as fine as 17 pixels a metre show."""
 LEAST_FACING = 0.25
 """Cosine between the normal and the way to the camera: flatter looks smear."""
 HIDDEN_M = 0.25
@@ -27,8 +31,6 @@ GAUSSIAN_WEIGHT = 0.3
 """What an opaque Gaussian says of the surface, against a point of LiDAR."""
 WIDEST_M = 0.3
 """A Gaussian that is wider says nothing of where the surface is."""
-OUTSIDE = 1.02
-"""Of the half size: who is farther out is no part of the body."""
 
 
 @dataclass(kw_only=True, eq=False)

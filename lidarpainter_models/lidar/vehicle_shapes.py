@@ -25,6 +25,13 @@ SHAPED = ("car", "van", "pickup", "vehicle")
 SHAPED_M = ((3.0, 6.2), (1.2, 2.8), (1.2, 2.8))
 """Least and most length, width and height of boxes whose shapes are known: what a data set calls a
 vehicle may be a bus."""
+SPACING_M = 0.06
+"""Between places on a surface: as fine as 17 pixels a metre show."""
+INSET_M = 0.04
+"""What stands for a surface lies so far inside it: discs reach out around bends, and a guess would
+hide what was seen beside it."""
+OUTSIDE = 1.02
+"""Of the half size of a box: who is farther out is no part of the body."""
 BUNDLED = Path(__file__).parent / "bundled" / "vehicle_shapes.safetensors"
 GRID = (48, 12, 20)
 """Nodes along x, |y| and z."""

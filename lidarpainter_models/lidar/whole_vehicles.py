@@ -27,13 +27,15 @@ from lidarpainter_models.lidar.actor_separation import (
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import NO_FRAME, LidarMap, MapPoints
 from lidarpainter_models.lidar.vehicle_colours import VehiclePlaces
-from lidarpainter_models.lidar.vehicle_shapes import fitted_shape, has_known_shape
+from lidarpainter_models.lidar.vehicle_shapes import (
+    INSET_M,
+    OUTSIDE,
+    SPACING_M,
+    fitted_shape,
+    has_known_shape,
+)
 from lidarpainter_models.scenes.tracks import ActorTrack
 
-SPACING_M = 0.06
-"""Between places on the surface."""
-INSET_M = 0.04
-"""Guessed points lie so far inside the surface, lest they hide what was seen beside them."""
 MEASURED_M = 0.12
 """A place nearer to a point that an image saw needs no guess."""
 COLOUR_M, COLOURS = 0.15, 3
@@ -44,8 +46,6 @@ LEAST_SEEN = 0.05
 """So is that of one whose surface was seen to a smaller share."""
 LOWEST_NORMAL = -0.5
 """What faces down by more is the underside."""
-OUTSIDE = 1.02
-"""Of the half size: who is farther out is no part of the body."""
 DARKEST = 0.02
 _GROUND_SAMPLE = 400_000
 
