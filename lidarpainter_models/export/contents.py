@@ -156,8 +156,8 @@ def scene_contents(
     """Take a scene apart.
 
     Poses are wanted at `timestamps_ns`, ascending; at one time alone, people are bent and lamps
-    lit as they are then, else people are at rest and lamps as on average. None takes all actors;
-    `with_sky` shows the sky by far Gaussians.
+    lit as they are then, else people are at rest, and lamps and the light of actors as on average.
+    None takes all actors; `with_sky` shows the sky by far Gaussians.
 
     Raises:
         SceneError: the scene has no such actor.
