@@ -114,9 +114,7 @@ def _resized(
     image: Float[Tensor, "height width"], height_px: int, width_px: int
 ) -> Float[Tensor, "rows columns"]:
     """An image of another size, its nearest pixels."""
-    rows = torch.arange(height_px) * image.shape[0] // height_px
-    columns = torch.arange(width_px) * image.shape[1] // width_px
-    return image[rows[:, None], columns]
+    return torch.nn.functional.interpolate(image[None, None], (height_px, width_px))[0, 0]
 
 
 def _render(scene: GaussianScene, view: TrainingView) -> SceneRender:
