@@ -25,6 +25,7 @@ from lidarpainter_models.lidar.actor_separation import (
     height_above_ground,
 )
 from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.lidar.lidar_images import BEAM_SPACING_RAD
 from lidarpainter_models.lidar.lidar_map import NO_FRAME, LidarMap, MapPoints
 from lidarpainter_models.lidar.vehicle_colours import VehiclePlaces
 from lidarpainter_models.lidar.vehicle_shapes import (
@@ -160,7 +161,7 @@ def _distance_m(places: Float[Tensor, "places 3"], others: Float[Tensor, "points
 
 
 def _guessed_points(xyz_m: Float[Tensor, "points 3"], rgb_u8: Tensor, body: MapPoints) -> MapPoints:
-    """Points as new as those of the body are on average, measured as coarsely."""
+    """Points as new as those of the body are on average, as coarse as they are apart."""
     count = len(xyz_m)
     return MapPoints(
         xyz_m=xyz_m,
@@ -168,5 +169,5 @@ def _guessed_points(xyz_m: Float[Tensor, "points 3"], rgb_u8: Tensor, body: MapP
         has_colour=torch.ones(count, dtype=torch.bool),
         frame_index=torch.full((count,), NO_FRAME),
         timestamp_ns=body.timestamp_ns.median().repeat(count),
-        range_m=body.range_m.median().repeat(count),
+        range_m=torch.full((count,), SPACING_M / BEAM_SPACING_RAD),
     )
